@@ -1,0 +1,1 @@
+"""What exists: public sources, products, and releases with the reader an estimator imports."""

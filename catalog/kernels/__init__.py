@@ -1,0 +1,1 @@
+"""Shared mathematics of the reader and the stages."""

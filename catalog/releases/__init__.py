@@ -1,0 +1,1 @@
+"""Manifests, integrity and the reader of published releases."""

@@ -1,0 +1,1 @@
+"""The machine: runs stages, keeps receipts, builds products, serves the command line."""

@@ -1,0 +1,1 @@
+"""Transforms of gridded magnetic anomalies."""

@@ -1,0 +1,1 @@
+"""Cutting and writing what a release holds."""
