@@ -1,0 +1,138 @@
+"""Artifacts: datasets that keep a contract, as netCDF-4 files that are never half written."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from magtiles.schemas import contracts
+from magtiles.schemas.errors import FormatError, MagtilesError
+
+_HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+_DEFLATE_LIMIT = 1032
+"""The most that zlib can expand; a file that declares more data than this holds none of it."""
+
+
+@contextlib.contextmanager
+def atomic_path(path: Path) -> Iterator[Path]:
+    """A temporary path in the folder of `path` that replaces it when the block succeeds.
+
+    The bytes are on disk (fsync) before the rename; when the block fails nothing is left.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        yield temporary
+        _sync(temporary)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    if os.name == "posix":  # Windows cannot open a folder
+        _sync(path.parent)
+
+
+def _sync(path: Path) -> None:
+    # Windows syncs only what is open for writing; a folder can only be opened for reading.
+    descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def write_artifact(dataset: xr.Dataset, path: Path, contract: str) -> None:
+    """Write a dataset, uncompressed, with its contract's full name in attribute `contract`.
+
+    The caller has checked the dataset. Raises MagtilesError when it cannot be written.
+    """
+    plain = dataset.drop_encoding()
+    plain.attrs |= {"Conventions": "CF-1.11", "contract": contracts.resolve(contract)}
+    encoding: dict[Any, Any] = {}
+    for name in plain.variables:
+        plain[name].attrs = _flags_like(plain[name])
+        encoding[name] = {"_FillValue": None}  # missing is NaN; a fill mark would turn u1 to float
+    with atomic_path(path) as temporary:
+        try:
+            plain.to_netcdf(temporary, engine="netcdf4", format="NETCDF4", encoding=encoding)
+        except (OSError, RuntimeError) as caught:  # netCDF4 says RuntimeError for a full disk
+            raise MagtilesError(
+                f"cannot be written ({caught})", where=path, remedy="check space and permissions"
+            ) from caught
+
+
+def open_artifact(path: Path) -> xr.Dataset:
+    """Open an artifact, its arrays loaded when first touched and kept in their stored dtype.
+
+    Raises FormatError for a file that is missing, truncated, damaged or of another format.
+    """
+    _check_signature(path)
+    try:
+        dataset = xr.open_dataset(
+            path, engine="netcdf4", mask_and_scale=False, decode_timedelta=False
+        )
+    except (OSError, RuntimeError, ValueError, AttributeError) as caught:
+        raise _damaged(path, caught) from caught
+    if dataset.nbytes > _DEFLATE_LIMIT * path.stat().st_size:
+        dataset.close()
+        raise FormatError(
+            f"declares {dataset.nbytes} bytes of arrays in a file of {path.stat().st_size}",
+            where=path,
+            remedy="build or fetch it again",
+        )
+    for variable in dataset.variables.values():
+        variable.attrs |= _flags_like(variable)
+    return dataset
+
+
+def load_checked(dataset: xr.Dataset, contract: str, *, path: Path, role: str) -> None:
+    """Check an opened artifact against a contract; this reads all of its arrays.
+
+    Raises ContractError naming file and role, FormatError when the arrays cannot be read.
+    """
+    where = f"{path} (role {role})"
+    try:
+        dataset.load()
+    except (OSError, RuntimeError) as caught:
+        raise _damaged(path, caught) from caught
+    contracts.check(dataset, contract, where=where)
+
+
+def _check_signature(path: Path) -> None:
+    if not path.is_file():
+        raise FormatError("no such file", where=path, remedy="check the path")
+    with path.open("rb") as file:
+        start = file.read(len(_HDF5_SIGNATURE))
+    if not start:
+        raise FormatError("the file is empty", where=path, remedy="build or fetch it again")
+    if start != _HDF5_SIGNATURE:
+        raise FormatError(
+            f"the file starts with {start!r}",
+            where=path,
+            expected="a netCDF-4 file",
+            remedy="bring foreign formats in with stage ingest-grid",
+        )
+
+
+def _damaged(path: Path, caught: Exception) -> FormatError:
+    return FormatError(
+        f"the file is truncated or damaged ({caught})",
+        where=path,
+        expected="a netCDF-4 file",
+        remedy="build or fetch it again",
+    )
+
+
+def _flags_like(variable: xr.Variable | xr.DataArray) -> dict[str, Any]:
+    # CF wants masks in the dtype of the flag; netCDF gives an array of one back as a scalar.
+    attrs = dict(variable.attrs)
+    for key in ("flag_masks", "flag_values"):
+        if key in attrs:
+            attrs[key] = np.atleast_1d(np.asarray(attrs[key], dtype=variable.dtype))
+    return attrs

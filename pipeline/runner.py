@@ -1,0 +1,132 @@
+"""Running one stage on files: contracts checked on both sides, receipts kept."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from magtiles.pipeline import receipts
+from magtiles.pipeline.artifacts import load_checked, open_artifact, write_artifact
+from magtiles.schemas import contracts
+from magtiles.schemas.errors import ContractError, FormatError, UsageError
+from magtiles.stages.declare import FILES, Many, Params, Stage, parse_params
+
+_LOG = logging.getLogger(__name__)
+
+_checked: set[tuple[str, str]] = set()
+"""(digest, contract) pairs that passed in this process and need no second look."""
+
+
+@dataclass(frozen=True)
+class StageResult:
+    """What `run_stage` did: the artifact, whether it was made now, and why (not)."""
+
+    out: Path
+    rebuilt: bool
+    reason: str
+
+
+def run_stage(
+    stage: Stage,
+    inputs: Mapping[str, Path | Sequence[Path]],
+    out: Path,
+    params: Mapping[str, Any],
+    *,
+    force: bool = False,
+) -> StageResult:
+    """Make `out` with a stage unless its receipt says that it is already what it would be.
+
+    Parameters
+    ----------
+    inputs : role to a path, or to a list of paths for roles of `FILES` and `Many`.
+    params : plain values, as from TOML.
+    force : run even when nothing changed.
+
+    Raises
+    ------
+    ParameterError, UsageError, FormatError, ContractError
+        The last names the role whose file breaks its contract, or the stage's output.
+    """
+    parsed = parse_params(stage.params, params, where=f"stage {stage.name}")
+    paths = _paths_by_role(stage, inputs, out)
+    made_from = receipts.identity(stage, parsed, paths)
+    reason = "forced" if force else receipts.why_stale(out, made_from)
+    if reason is None:
+        _LOG.info("%s: %s is up to date", stage.name, out)
+        return StageResult(out, rebuilt=False, reason="up to date")
+    _LOG.info("%s: making %s (%s)", stage.name, out, reason)
+    _make(stage, parsed, paths, out)
+    sha256 = receipts.write_receipt(out, made_from)
+    _checked.add((sha256, contracts.resolve(stage.output)))
+    return StageResult(out, rebuilt=True, reason=reason)
+
+
+def _make(stage: Stage, params: Params, paths: Mapping[str, list[Path]], out: Path) -> None:
+    with contextlib.ExitStack() as opened:
+        arguments = {
+            role: _argument(stage.inputs[role], role, files, opened)
+            for role, files in paths.items()
+        }
+        result = stage.run(**arguments, params=params)
+        contracts.check(result, stage.output, where=f"output of stage {stage.name}")
+        write_artifact(result, out, stage.output)
+
+
+def _argument(
+    kind: str | Many, role: str, files: list[Path], opened: contextlib.ExitStack
+) -> list[Path] | list[xr.Dataset] | xr.Dataset:
+    if kind == FILES:
+        return files
+    contract = kind.contract if isinstance(kind, Many) else kind
+    datasets = []
+    for path in files:
+        dataset = opened.enter_context(open_artifact(path))
+        _check_input(dataset, contracts.resolve(contract), path, role)
+        datasets.append(dataset)
+    return datasets if isinstance(kind, Many) else datasets[0]
+
+
+def _check_input(dataset: xr.Dataset, wanted: str, path: Path, role: str) -> None:
+    claimed = str(dataset.attrs.get("contract", wanted))
+    if claimed.partition("/")[0] != wanted.partition("/")[0]:
+        raise ContractError(
+            f"the file holds a {claimed}", where=f"{path} (role {role})", expected=wanted
+        )
+    key = (receipts.digest(path), wanted)
+    if key not in _checked:
+        load_checked(dataset, wanted, path=path, role=role)
+        _checked.add(key)
+
+
+def _paths_by_role(
+    stage: Stage, inputs: Mapping[str, Path | Sequence[Path]], out: Path
+) -> dict[str, list[Path]]:
+    where = f"stage {stage.name}"
+    for role in inputs.keys() - stage.inputs.keys():
+        known = ", ".join(stage.inputs)
+        raise UsageError(f"unknown role '{role}'", where=where, expected=f"one of {known}")
+    paths: dict[str, list[Path]] = {}
+    for role, kind in stage.inputs.items():
+        given = inputs.get(role, ())
+        files = [given] if isinstance(given, Path) else list(given)
+        if not files:
+            raise UsageError(f"no file for role '{role}'", where=where, remedy=f"give {role}=FILE")
+        if len(files) > 1 and not (kind == FILES or isinstance(kind, Many)):
+            raise UsageError(f"{len(files)} files for role '{role}'", where=where, expected="one")
+        for path in files:
+            _check_input_path(path, role, out)
+        paths[role] = files
+    return paths
+
+
+def _check_input_path(path: Path, role: str, out: Path) -> None:
+    if not path.is_file():
+        raise FormatError("no such file", where=f"{path} (role {role})", remedy="check the path")
+    if path.resolve() == out.resolve():
+        raise UsageError("the output would replace its input", where=f"{path} (role {role})")
