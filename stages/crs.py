@@ -27,7 +27,7 @@ _SAME_PLACE_DEG = 1e-7  # about 1 cm: projection parameters printed with few dig
 
 @dataclass(frozen=True)
 class DatumOperation:
-    """How coordinates become WGS84: PROJ's name, accuracy in metres (None: not stated), pipeline."""
+    """How coordinates become WGS84: name, accuracy in metres (None: not stated), PROJ pipeline."""
 
     name: str
     accuracy_m: float | None

@@ -1,0 +1,236 @@
+"""CF netCDF grids through xarray (CF-1.11 sections 2.5, 4, 5.6, 7.1 and 8.1)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import netCDF4
+import numpy as np
+import pyproj
+import xarray as xr
+from numpy.typing import NDArray
+from pyproj.exceptions import CRSError
+
+from magtiles.schemas.errors import FormatError, SourceError
+from magtiles.stages.ingest.raw import RawGrid, is_magnetic
+from magtiles.stages.ingest.source import IngestGridParams
+
+_MAX_NODES = 400_000_000  # 3.2 GB of float64: a small file can declare any size
+
+_METRES = {"m": 1.0, "metre": 1.0, "meter": 1.0, "metres": 1.0, "meters": 1.0}
+_METRES |= {"km": 1000.0, "kilometre": 1000.0, "kilometer": 1000.0}
+_METRES |= {"us_survey_foot": 1200.0 / 3937.0, "ft": 0.3048, "foot": 0.3048, "feet": 0.3048}
+_NORTH = ("degrees_north", "degree_north", "degrees_n", "degree_n")
+_EAST = ("degrees_east", "degree_east", "degrees_e", "degree_e")
+
+_STATED = (
+    "reference_field",
+    "reference_epoch",
+    "anomaly_definition",
+    "height_reference",
+    "line_spacing_m",
+    "source_distance_m",
+    "wavelength_band_km",
+)
+
+
+def read_cf(path: Path, params: IngestGridParams) -> RawGrid:
+    """The magnetic variable of a CF netCDF file, its nodes, CRS and what its attributes state.
+
+    Raises FormatError for a damaged file, missing or curvilinear coordinates; SourceError
+    where the variable is not clear.
+    """
+    try:
+        # xarray unpacks into float32, so packed integers are unpacked here in float64.
+        with xr.open_dataset(
+            path, engine="netcdf4", mask_and_scale=False, decode_times=False
+        ) as dataset:
+            return _read(dataset, path, params)
+    except (OSError, RuntimeError, ValueError, KeyError, IndexError) as caught:
+        raise FormatError(
+            f"is not a whole netCDF file: {str(caught).replace(str(path), path.name)}",
+            where=path.name,
+            remedy="fetch it again",
+        ) from None
+
+
+def _read(dataset: xr.Dataset, path: Path, params: IngestGridParams) -> RawGrid:
+    name = _choose_variable(dataset, path, params)
+    where = f"{path.name} variable '{name}'"
+    variable = dataset[name]
+    if variable.size > _MAX_NODES:
+        raise FormatError(
+            f"declares {variable.size} values", where=where, expected=f"at most {_MAX_NODES}"
+        )
+    y_dim, x_dim = _axes(dataset, variable, where)
+    flat = variable.squeeze([d for d in variable.dims if d not in (y_dim, x_dim)], drop=True)
+    crs = _crs(dataset, variable, where)
+    says = _stated(dataset, variable, x_dim)
+    mark = None if "no_data" in says else params.no_data
+    error_name = f"{name}_uncertainty"
+    x, x_ulp = _nodes(dataset, x_dim, crs, where)
+    y, y_ulp = _nodes(dataset, y_dim, crs, where)
+    return RawGrid(
+        values=_unpacked(flat.transpose(y_dim, x_dim), mark),
+        x=x,
+        y=y,
+        x_ulp=x_ulp,
+        y_ulp=y_ulp,
+        crs=crs,
+        says=says,
+        uncertainty=_uncertainty(dataset, error_name, (y_dim, x_dim)),
+    )
+
+
+def _choose_variable(dataset: xr.Dataset, path: Path, params: IngestGridParams) -> str:
+    grids = [str(n) for n, v in dataset.data_vars.items() if v.squeeze().ndim == 2]
+    if params.variable is not None:
+        if params.variable not in grids:
+            raise SourceError(
+                f"no two-dimensional variable '{params.variable}'",
+                where=f"{path.name} key 'variable'",
+                expected=f"one of {', '.join(grids) or 'none'}",
+            )
+        return params.variable
+    magnetic = [n for n in grids if is_magnetic(str(dataset[n].attrs.get("units", "")))]
+    found = [n for n in magnetic if n.removesuffix("_uncertainty") not in set(magnetic) - {n}]
+    if not found and params.units is not None:
+        found = [n for n in grids if "units" not in dataset[n].attrs]
+    if len(found) != 1:
+        raise SourceError(
+            f"{len(found)} variables could be the anomaly: {', '.join(found) or 'none'}",
+            where=path.name,
+            expected="one two-dimensional variable with a magnetic unit such as nT",
+            remedy=f"choose one with the key 'variable' (grids: {', '.join(grids) or 'none'})",
+        )
+    return found[0]
+
+
+def _axes(dataset: xr.Dataset, variable: xr.DataArray, where: str) -> tuple[str, str]:
+    """Dimensions along y (or latitude) and x (or longitude)."""
+    long = [str(d) for d, n in variable.sizes.items() if n > 1]
+    if len(long) != 2:
+        raise SourceError(f"has dimensions {dict(variable.sizes)}", where=where, expected="two")
+    missing = [d for d in long if d not in dataset.variables or dataset[d].dims != (d,)]
+    if missing:
+        raise FormatError(
+            f"dimension '{missing[0]}' has no coordinate of its own",
+            where=where,
+            expected="a coordinate variable per axis (a curvilinear grid is not supported)",
+            remedy="resample it to a regular grid",
+        )
+    kinds = [_axis_kind(dataset[d]) for d in long]
+    if set(kinds) == {"x", "y"}:
+        return (long[0], long[1]) if kinds[0] == "y" else (long[1], long[0])
+    raise FormatError(
+        f"which of {long[0]} and {long[1]} is the eastward axis is not stated",
+        where=where,
+        expected="coordinates with units degrees_north and degrees_east, or the standard names "
+        "projection_x_coordinate and projection_y_coordinate",
+    )
+
+
+def _axis_kind(coordinate: xr.DataArray) -> str | None:
+    unit = str(coordinate.attrs.get("units", "")).lower()
+    standard = coordinate.attrs.get("standard_name", "")
+    axis = str(coordinate.attrs.get("axis", "")).lower()
+    name = str(coordinate.name).lower()
+    if unit in _EAST or standard in ("projection_x_coordinate", "longitude"):
+        return "x"
+    if unit in _NORTH or standard in ("projection_y_coordinate", "latitude"):
+        return "y"
+    if axis in ("x", "y"):
+        return axis
+    return {"x": "x", "easting": "x", "y": "y", "northing": "y"}.get(name)
+
+
+def _nodes(
+    dataset: xr.Dataset, dim: str, crs: pyproj.CRS | None, where: str
+) -> tuple[NDArray[np.float64], float]:
+    """Nodes along an axis in units of the CRS, and the rounding they were stored with."""
+    coordinate = dataset[dim]
+    stored = coordinate.values
+    rounding = float(np.spacing(np.abs(stored).max())) if stored.dtype.kind == "f" else 0.0
+    nodes = _unpacked(coordinate, None)
+    bounds = coordinate.attrs.get("bounds")
+    if bounds in dataset.variables and dataset[bounds].shape == (nodes.size, 2):
+        # A coordinate may stand anywhere in its cell (CF 7.1); the value is the cell's.
+        nodes = _unpacked(dataset[bounds], None).mean(axis=1)
+    unit = str(coordinate.attrs.get("units", "")).lower()
+    factor = _METRES.get(unit, 1.0)
+    if crs is not None and crs.is_projected and unit in _METRES:
+        factor /= crs.axis_info[0].unit_conversion_factor
+    elif crs is not None and crs.is_projected and unit:
+        raise FormatError(
+            f"coordinate '{dim}' is in '{unit}', but the CRS is projected",
+            where=where,
+            expected=f"one of {', '.join(_METRES)}",
+        )
+    return nodes * factor, rounding * factor
+
+
+def _crs(dataset: xr.Dataset, variable: xr.DataArray, where: str) -> pyproj.CRS | None:
+    mapping = variable.attrs.get("grid_mapping") or variable.encoding.get("grid_mapping")
+    if mapping is None:
+        return None
+    name = str(mapping).split(":")[0].split()[0]
+    if name not in dataset.variables:
+        raise FormatError(f"its grid mapping '{name}' is missing", where=where)
+    try:
+        return pyproj.CRS.from_cf(dataset[name].attrs)
+    except (CRSError, KeyError) as caught:
+        raise FormatError(
+            f"its grid mapping '{name}' is not understood: {caught}", where=where
+        ) from None
+
+
+def _stated(dataset: xr.Dataset, variable: xr.DataArray, x_dim: str) -> dict[str, Any]:
+    says: dict[str, Any] = {k: dataset.attrs[k] for k in _STATED if k in dataset.attrs}
+    for key, value in says.items():
+        says[key] = value.item() if isinstance(value, np.generic) else value
+    if "wavelength_band_km" in says:
+        says["wavelength_band_km"] = tuple(float(v) for v in says["wavelength_band_km"])
+    if "units" in variable.attrs:
+        says["units"] = str(variable.attrs["units"])
+    for name in ("_FillValue", "missing_value"):
+        mark = np.atleast_1d(variable.attrs.get(name, np.nan))
+        if mark.size == 1 and np.isfinite(mark[0]):
+            says["no_data"] = float(mark[0])
+    if "bounds" in dataset[x_dim].attrs:
+        says["registration"] = "pixel"
+    height = dataset.variables.get("height")
+    if height is not None and height.ndim == 0 and height.attrs.get("units") == "m":
+        says["height_m"] = float(height)
+    return says
+
+
+def _uncertainty(
+    dataset: xr.Dataset, name: str, dims: tuple[str, str]
+) -> NDArray[np.float64] | None:
+    if name not in dataset.variables:
+        return None
+    found = dataset[name]
+    return _unpacked(found if found.ndim == 0 else found.squeeze().transpose(*dims), None)
+
+
+def _unpacked(variable: xr.DataArray, extra_mark: float | None) -> NDArray[np.float64]:
+    """Values as float64, unpacked (CF 8.1), with what the attributes mark missing (2.5.1) NaN."""
+    stored = np.asarray(variable.values)
+    attrs = variable.attrs
+    if str(attrs.get("_Unsigned", "false")).lower() == "true" and stored.dtype.kind == "i":
+        stored = stored.view(f"u{stored.dtype.itemsize}")
+    void = np.zeros(stored.shape, dtype=bool)
+    marks = [attrs.get("_FillValue"), attrs.get("missing_value"), extra_mark]
+    if attrs.get("_FillValue") is None and stored.dtype.kind == "f":
+        marks.append(netCDF4.default_fillvals[stored.dtype.str[1:]])
+    for mark in np.concatenate([np.atleast_1d(m) for m in marks if m is not None] or [[]]):
+        void |= stored == stored.dtype.type(mark)
+    low, high = attrs.get("valid_range", (attrs.get("valid_min"), attrs.get("valid_max")))
+    if low is not None:
+        void |= stored < low
+    if high is not None:
+        void |= stored > high
+    values = stored * np.float64(attrs.get("scale_factor", 1.0))
+    values = values + np.float64(attrs.get("add_offset", 0.0))
+    return np.where(void, np.nan, values)

@@ -1,0 +1,116 @@
+"""What a foreign file is, by its first bytes, before any library parses it."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import BinaryIO
+
+from magtiles.schemas.errors import FormatError
+
+_MAGIC = {
+    b"II*\x00": "geotiff",
+    b"MM\x00*": "geotiff",
+    b"II+\x00": "geotiff",
+    b"MM\x00+": "geotiff",
+    b"\x89HDF": "netcdf",
+    b"CDF\x01": "netcdf",
+    b"CDF\x02": "netcdf",
+    b"CDF\x05": "netcdf",
+}
+_KNOWN_OTHERS = {
+    b"PK\x03\x04": "a zip archive",
+    b"\x1f\x8b": "gzip-compressed",
+    b"\xfd7zXZ": "xz-compressed",
+    b"%PDF": "a PDF document",
+    b"\x89PNG": "a PNG picture",
+}
+_HEAD_BYTES = 65536
+
+
+def sniff(path: Path) -> str:
+    """``geotiff``, ``gxf`` or ``netcdf``, by content.
+
+    Raises FormatError for a missing, empty or unreadable file, a folder, and other formats.
+    """
+    if path.is_dir():
+        raise FormatError("is a folder", where=path.name, expected="a grid file")
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+    except FileNotFoundError:
+        raise FormatError(
+            "the file does not exist", where=path, remedy="fetch it or correct the path"
+        ) from None
+    except OSError as caught:
+        raise FormatError(f"cannot be read: {caught.strerror}", where=path.name) from None
+    if not head:
+        raise FormatError("the file is empty", where=path.name, remedy="fetch it again")
+    for magic, kind in _MAGIC.items():
+        if head.startswith(magic):
+            return kind
+    if any(line.strip().upper().startswith(b"#GRID") for line in head.splitlines()) or (
+        b"#POINTS" in head.upper()
+    ):
+        return "gxf"
+    raise FormatError(
+        f"is {_describe(head)}",
+        where=f"{path.name} byte 0",
+        expected="GeoTIFF, GXF or netCDF",
+        remedy="unpack or convert it first",
+    )
+
+
+def check_tiff_directories(path: Path) -> None:
+    """Raise FormatError unless every tag of a TIFF lies inside the file.
+
+    A truncated TIFF otherwise loses its void mark or CRS with no more than a warning.
+    """
+    size = path.stat().st_size
+    try:
+        with path.open("rb") as file:
+            _walk_directories(file, size)
+    except (struct.error, OverflowError):
+        raise FormatError(
+            f"a TIFF directory points past the end of the file ({size} bytes)",
+            where=path.name,
+            remedy="the file is truncated: fetch it again",
+        ) from None
+
+
+_TYPE_BYTES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8}
+_TYPE_BYTES |= {13: 4, 16: 8, 17: 8, 18: 8}  # IFD and the 64-bit types of BigTIFF
+
+
+def _walk_directories(file: BinaryIO, size: int) -> None:
+    head = file.read(16)
+    order = "<" if head[:2] == b"II" else ">"
+    (version,) = struct.unpack_from(order + "H", head, 2)
+    # Classic TIFF counts in 32 bits, BigTIFF in 64.
+    count, entry, pointer = (
+        (struct.Struct(order + code) for code in ("Q", "HHQQ", "Q"))
+        if version == 43
+        else (struct.Struct(order + code) for code in ("H", "HHLL", "L"))
+    )
+    (offset,) = pointer.unpack_from(head, 8 if version == 43 else 4)
+    seen: set[int] = set()
+    while offset and offset not in seen:
+        seen.add(offset)
+        file.seek(offset)
+        (entries,) = count.unpack(file.read(count.size))
+        for _ in range(entries):
+            _, kind, values, place = entry.unpack(file.read(entry.size))
+            length = _TYPE_BYTES.get(kind, 1) * values
+            if length > pointer.size and place + length > size:
+                raise struct.error("a tag's values lie outside the file")
+        (offset,) = pointer.unpack(file.read(pointer.size))
+
+
+def _describe(head: bytes) -> str:
+    for magic, name in _KNOWN_OTHERS.items():
+        if head.startswith(magic):
+            return name
+    start = head[:512].lstrip().lower()
+    if start.startswith((b"<!doctype html", b"<html")):
+        return "an HTML page"
+    return "binary data of an unknown kind" if b"\x00" in head[:512] else "text of an unknown kind"

@@ -1,0 +1,214 @@
+"""Grid eXchange Format (GXF revision 3, Geosoft 1999), text form.
+
+Read here and not through GDAL: of GXF, GDAL 3.10 ignores ``#ROTATION`` and ``#TRANSFORM``,
+reads a truncated file as if whole and misplaces values when rows do not start on a line.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyproj
+import rasterio
+from numpy.typing import NDArray
+from pyproj.exceptions import CRSError
+from rasterio.errors import RasterioError
+
+from magtiles.schemas.errors import FormatError, SourceError
+from magtiles.stages.ingest.raw import RawGrid, mark_voids
+from magtiles.stages.ingest.source import IngestGridParams
+
+_LOG = logging.getLogger(__name__)
+
+_METRES = {
+    "m": 1.0,
+    "meter": 1.0,
+    "meters": 1.0,
+    "metre": 1.0,
+    "metres": 1.0,
+    "km": 1000.0,
+    "kilometers": 1000.0,
+    "kilometres": 1000.0,
+    "feet": 0.3048,
+    "us feet": 1200.0 / 3937.0,
+    "us survey feet": 1200.0 / 3937.0,
+}
+
+# The USGS's non-standard projection keywords; both projections have two standard parallels.
+_USGS_PROJECTIONS = {
+    "lambert conformal conic": "lcc",
+    "albers": "aea",
+    "albers equal area": "aea",
+    "albers equal area conic": "aea",
+    "albers conical equal area": "aea",
+}
+
+
+def read_gxf(path: Path, params: IngestGridParams) -> RawGrid:
+    """A GXF grid; its values are at points, the first at the lower left.
+
+    Raises FormatError where the file is truncated, compressed, rotated or malformed.
+    """
+    header, body = _split(path)
+    shape = (int(_number(header, "ROWS", path)), int(_number(header, "POINTS", path)))
+    _refuse_unusual(header, path)
+    stored = _values(body, shape, path)
+    dummy = _number(header, "DUMMY", path) if "DUMMY" in header else None
+    values = mark_voids(stored, dummy if dummy is not None else params.no_data)
+    scale, offset = _transform(header, path)
+    x = _axis(header, "XORIGIN", "PTSEPARATION", shape[1], path)
+    y = _axis(header, "YORIGIN", "RWSEPARATION", shape[0], path)
+    says: dict[str, Any] = {"registration": "point"}
+    if dummy is not None:
+        says["no_data"] = dummy
+    return RawGrid(values * scale + offset, x, y, _crs(header, path), says=says)
+
+
+def _split(path: Path) -> tuple[dict[str, list[str]], str]:
+    """Keywords with the lines that follow each, and the text after #GRID."""
+    text = path.read_text(encoding="latin-1")
+    header: dict[str, list[str]] = {}
+    keyword = None
+    position = 0
+    for line in text.splitlines(keepends=True):
+        position += len(line)
+        if line.startswith("#"):
+            keyword = line[1:].split(maxsplit=1)[0].upper() if line[1:].strip() else ""
+            if keyword == "GRID":
+                return header, text[position:]
+            header[keyword] = []
+        elif keyword is not None and line.strip():
+            header[keyword].append(line.strip())
+    raise FormatError(
+        "the keyword #GRID is missing",
+        where=path.name,
+        remedy="the file is truncated or not GXF: fetch it again",
+    )
+
+
+def _number(
+    header: dict[str, list[str]], keyword: str, path: Path, default: float | None = None
+) -> float:
+    if keyword not in header:
+        if default is not None:
+            return default
+        raise FormatError(f"the keyword #{keyword} is missing", where=path.name)
+    try:
+        value = float(header[keyword][0].split()[0])
+    except (IndexError, ValueError):
+        found = header[keyword][0] if header[keyword] else "nothing"
+        raise FormatError(
+            f"#{keyword} is followed by '{found}'", where=path.name, expected="a number"
+        ) from None
+    if not np.isfinite(value):
+        raise FormatError(f"#{keyword} is {value}", where=path.name, expected="a finite number")
+    return value
+
+
+def _refuse_unusual(header: dict[str, list[str]], path: Path) -> None:
+    unusual = {
+        "ROTATION": (0.0, "resample the grid without rotation"),
+        "SENSE": (1.0, "rewrite it with the first point at the lower left and rows along x"),
+        "GTYPE": (0.0, "convert the compressed grid to GeoTIFF"),
+    }
+    for keyword, (usual, remedy) in unusual.items():
+        value = _number(header, keyword, path, default=usual)
+        if value != usual:
+            raise FormatError(
+                f"#{keyword} is {value:g}", where=path.name, expected=f"{usual:g}", remedy=remedy
+            )
+
+
+def _values(body: str, shape: tuple[int, int], path: Path) -> NDArray[np.float64]:
+    words = body.split()
+    expected = shape[0] * shape[1]
+    if min(shape) < 1 or len(words) != expected:
+        raise FormatError(
+            f"{len(words)} values after #GRID",
+            where=path.name,
+            expected=f"#POINTS x #ROWS = {shape[1]} x {shape[0]} = {expected}",
+            remedy="the file is truncated or damaged: fetch it again",
+        )
+    try:
+        return np.array(words, dtype=np.float64).reshape(shape)
+    except ValueError:
+        index = next(i for i, word in enumerate(words) if not _is_number(word))
+        raise FormatError(
+            f"value {index} after #GRID is '{words[index]}'",
+            where=f"{path.name} row {index // shape[1]}, point {index % shape[1]}",
+            expected="a number",
+        ) from None
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _transform(header: dict[str, list[str]], path: Path) -> tuple[float, float]:
+    """Scale and offset from stored numbers to values."""
+    words = " ".join(header.get("TRANSFORM", ["1 0"])).split()
+    try:
+        scale, offset = float(words[0]), float(words[1])
+    except (IndexError, ValueError):
+        raise FormatError(
+            f"#TRANSFORM is '{' '.join(words)}'", where=path.name, expected="scale and offset"
+        ) from None
+    return scale, offset
+
+
+def _axis(
+    header: dict[str, list[str]], origin: str, separation: str, count: int, path: Path
+) -> NDArray[np.float64]:
+    step = _number(header, separation, path, default=1.0)
+    if step <= 0:
+        raise FormatError(f"#{separation} is {step:g}", where=path.name, expected="above zero")
+    return _number(header, origin, path, default=0.0) + step * np.arange(count)
+
+
+def _crs(header: dict[str, list[str]], path: Path) -> pyproj.CRS | None:
+    if "MAP_PROJECTION" in header:
+        return _standard_crs(path)
+    return _usgs_crs(header, path) if "PRJTYPE" in header else None
+
+
+def _standard_crs(path: Path) -> pyproj.CRS | None:
+    try:
+        with rasterio.open(path, driver="GXF") as dataset:
+            return pyproj.CRS.from_user_input(dataset.crs) if dataset.crs else None
+    except (RasterioError, CRSError) as caught:
+        _LOG.warning("%s: #MAP_PROJECTION is not understood (%s)", path.name, caught)
+        return None
+
+
+def _usgs_crs(header: dict[str, list[str]], path: Path) -> pyproj.CRS | None:
+    """The CRS of the USGS's keywords: an ellipsoid by its radii, the datum not stated."""
+    name = " ".join(header["PRJTYPE"]).lower()
+    projection = _USGS_PROJECTIONS.get(name)
+    if projection is None:
+        _LOG.warning("%s: #PRJTYPE '%s' is not known, [grid] crs is needed", path.name, name)
+        return None
+    unit = " ".join(header.get("PRJUNIT", ["meters"])).lower()
+    if unit not in _METRES:
+        raise SourceError(
+            f"#PRJUNIT is '{unit}'", where=path.name, expected=f"one of {', '.join(_METRES)}"
+        )
+    terms = {
+        "a": "A_AXIS_RADIUS",
+        "b": "B_AXIS_RADIUS",
+        "lon_0": "RFLONGITUDE",
+        "lat_0": "RFLATITUDE",
+        "lat_1": "FIRST_STANDARD_PARALLEL",
+        "lat_2": "SECOND_STANDARD_PARALLEL",
+    }
+    values: dict[str, Any] = {term: _number(header, key, path) for term, key in terms.items()}
+    metres = _METRES[unit]
+    values["x_0"] = _number(header, "FLSEASTING", path, default=0.0) * metres
+    values["y_0"] = _number(header, "FLSNORTHING", path, default=0.0) * metres
+    return pyproj.CRS.from_dict({"proj": projection, **values, "to_meter": metres})
