@@ -32,9 +32,7 @@ class Params(pydantic.BaseModel):
 
 def quantity(unit: str, *, doc: str, default: Any = PydanticUndefined, **limits: Any) -> Any:
     """A parameter field with its unit ("1" for none), description and limits (gt, ge, lt, le)."""
-    return pydantic.Field(
-        default, description=doc, json_schema_extra={"unit": unit}, **limits
-    )
+    return pydantic.Field(default, description=doc, json_schema_extra={"unit": unit}, **limits)
 
 
 @dataclass(frozen=True)
@@ -95,7 +93,9 @@ def _first_problem(
     if problem["type"] == "extra_forbidden":
         known = ", ".join(sorted(kind.model_fields)) or "none"
         return error(
-            f"unknown key '{key}'", where=where, expected=f"one of {known}",
+            f"unknown key '{key}'",
+            where=where,
+            expected=f"one of {known}",
             remedy="correct or remove it",
         )
     if problem["type"] == "missing":
@@ -103,7 +103,8 @@ def _first_problem(
         meaning = f" ({field.description})" if field is not None and field.description else ""
         return error(f"key '{key}' is missing{meaning}", where=where, remedy=f"add {key} = ...")
     return error(
-        f"key '{key}' is {problem['input']!r}", where=where,
+        f"key '{key}' is {problem['input']!r}",
+        where=where,
         expected=problem["msg"].removeprefix("Input should be ").removeprefix("Value error, "),
     )
 
