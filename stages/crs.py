@@ -9,12 +9,13 @@ from __future__ import annotations
 import json
 import warnings
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pyproj
-import pyproj.network
 import xarray as xr
 from numpy.typing import NDArray
+from pyproj import network
 from pyproj.aoi import AreaOfInterest
 from pyproj.transformer import TransformerGroup
 
@@ -49,8 +50,8 @@ def to_wgs84(
 
     Raises SourceError when only a ballpark operation exists and `allow_ballpark` is False.
     """
-    pyproj.network.set_network_enabled(active=False)
-    area = None if region is None else AreaOfInterest(*region)
+    _offline()
+    area: Any = None if region is None else AreaOfInterest(*region)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # better grids that are not installed
         group = TransformerGroup(
@@ -90,7 +91,7 @@ def dataset_to_wgs84(dataset: xr.Dataset) -> pyproj.Transformer:
     """
     pipeline = dataset.attrs.get("datum_pipeline")
     if pipeline is not None:
-        pyproj.network.set_network_enabled(active=False)
+        _offline()
         return pyproj.Transformer.from_pipeline(str(pipeline))
     allow = bool(dataset.attrs.get("allow_ballpark_datum", 0))
     return to_wgs84(dataset_crs(dataset), allow_ballpark=allow)
@@ -149,8 +150,8 @@ def agree(
         return True
     if first.is_geographic != second.is_geographic or not _one_ellipsoid(first, second):
         return False
-    places = [_on_own_datum(crs, x, y) for crs in (first, second)]
-    if not np.allclose(*places, rtol=0.0, atol=_SAME_PLACE_DEG):
+    apart = _on_own_datum(first, x, y) - _on_own_datum(second, x, y)
+    if not np.all(np.abs(apart) < _SAME_PLACE_DEG):
         return False
     if not (states_datum(first) and states_datum(second)):
         return True
@@ -178,6 +179,10 @@ def geographic_bounds(
     west, south, east, north = bounds
     wrapped = [(lon + 180.0) % 360.0 - 180.0 if abs(lon) > 180.0 else lon for lon in (west, east)]
     return wrapped[0], south, wrapped[1], north
+
+
+def _offline() -> None:
+    network.set_network_enabled(active=False)  # type: ignore[attr-defined]  # missing in its stub
 
 
 def _one_ellipsoid(first: pyproj.CRS, second: pyproj.CRS) -> bool:

@@ -224,7 +224,7 @@ def _unpacked(variable: xr.DataArray, extra_mark: float | None) -> NDArray[np.fl
     marks = [attrs.get("_FillValue"), attrs.get("missing_value"), extra_mark]
     if attrs.get("_FillValue") is None and stored.dtype.kind == "f":
         marks.append(netCDF4.default_fillvals[stored.dtype.str[1:]])
-    for mark in np.concatenate([np.atleast_1d(m) for m in marks if m is not None] or [[]]):
+    for mark in (one for m in marks if m is not None for one in np.atleast_1d(m)):
         void |= stored == stored.dtype.type(mark)
     low, high = attrs.get("valid_range", (attrs.get("valid_min"), attrs.get("valid_max")))
     if low is not None:

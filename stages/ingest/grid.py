@@ -188,15 +188,17 @@ def _settled_crs(raw: RawGrid, facts: _Facts) -> pyproj.CRS:
             given = coordinates.horizontal(pyproj.CRS.from_user_input(facts.params.crs))
         except CRSError as caught:
             raise SourceError(f"key 'crs' is not a CRS: {caught}", where=facts.where) from None
-    if raw.crs is None and given is None:
-        raise SourceError(
-            f"key 'crs' is missing and the file {facts.file} does not say",
-            where=facts.where,
-            remedy="add crs = ... under [grid] of its source TOML, or as a parameter",
-        )
-    if raw.crs is None or given is None:
-        return coordinates.horizontal(raw.crs) if given is None else given
+    if raw.crs is None:
+        if given is None:
+            raise SourceError(
+                f"key 'crs' is missing and the file {facts.file} does not say",
+                where=facts.where,
+                remedy="add crs = ... under [grid] of its source TOML, or as a parameter",
+            )
+        return given
     own = coordinates.horizontal(raw.crs)
+    if given is None:
+        return own
     corners = np.array([raw.x[0], raw.x[-1]]), np.array([raw.y[0], raw.y[-1]])
     if not coordinates.agree(own, given, *corners):
         raise SourceError(

@@ -169,7 +169,7 @@ def _axis(
     step = _number(header, separation, path, default=1.0)
     if step <= 0:
         raise FormatError(f"#{separation} is {step:g}", where=path.name, expected="above zero")
-    return _number(header, origin, path, default=0.0) + step * np.arange(count)
+    return _number(header, origin, path, default=0.0) + step * np.arange(count, dtype=np.float64)
 
 
 def _crs(header: dict[str, list[str]], path: Path) -> pyproj.CRS | None:
