@@ -16,6 +16,7 @@ from magtiles.pipeline.artifacts import load_checked, open_artifact, write_artif
 from magtiles.schemas import contracts
 from magtiles.schemas.errors import ContractError, FormatError, UsageError
 from magtiles.stages.declare import FILES, Many, Params, Stage, parse_params
+from magtiles.stages.ingest.source import load_source
 
 _LOG = logging.getLogger(__name__)
 
@@ -55,7 +56,7 @@ def run_stage(
     """
     parsed = parse_params(stage.params, params, where=f"stage {stage.name}")
     paths = _paths_by_role(stage, inputs, out)
-    made_from = receipts.identity(stage, parsed, paths)
+    made_from = receipts.identity(stage, parsed, _with_data_files(stage, paths))
     reason = "forced" if force else receipts.why_stale(out, made_from)
     if reason is None:
         _LOG.info("%s: %s is up to date", stage.name, out)
@@ -130,3 +131,20 @@ def _check_input_path(path: Path, role: str, out: Path) -> None:
         raise FormatError("no such file", where=f"{path} (role {role})", remedy="check the path")
     if path.resolve() == out.resolve():
         raise UsageError("the output would replace its input", where=f"{path} (role {role})")
+
+
+def _with_data_files(stage: Stage, paths: Mapping[str, list[Path]]) -> dict[str, list[Path]]:
+    """The inputs together with the data files that source TOMLs among them name."""
+    complete = dict(paths)
+    for role in (role for role, kind in stage.inputs.items() if kind == FILES):
+        given = {path.name for path in paths[role]}
+        for toml in (path for path in paths[role] if path.suffix.lower() == ".toml"):
+            # A file given beside its TOML stands in for the TOML's own of that name.
+            named = [file for file in load_source(toml).files if file.name not in given]
+            for file in named:
+                if not file.is_file():
+                    raise FormatError(
+                        "no such file", where=file, remedy=f"fetch it, or correct {toml}"
+                    )
+            complete[role] = [*complete[role], *named]
+    return complete

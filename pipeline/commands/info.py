@@ -1,0 +1,158 @@
+"""Say what a release holds: identity, coverage, levels, accuracy, flags, files, inputs."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from magtiles.pipeline.output import print_json, print_table
+
+if TYPE_CHECKING:
+    from magtiles.catalog.releases.manifest import Manifest
+
+HELP = "say what a release holds"
+NEEDS_PIPELINE = False
+
+_UNCERTAINTIES = {
+    "magnetic_anomaly_uncertainty": "nT",
+    "vector_uncertainty": "nT",
+    "tensor_uncertainty": "nT/km",
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``magtiles info``."""
+    parser.add_argument("release", type=Path, metavar="RELEASE", help="folder of a release")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print what the manifest says; the files themselves are `validate`'s business."""
+    from magtiles.catalog.releases.manifest import read_manifest
+
+    manifest = read_manifest(arguments.release)
+    described = describe(manifest)
+    if arguments.json:
+        print_json(described)
+    else:
+        _print_described(described, arguments.release)
+    return 0
+
+
+def describe(manifest: Manifest) -> dict[str, Any]:
+    """A manifest as plain values: shares over all core nodes, sizes in bytes."""
+    lattice = manifest.lattice
+    return {
+        "product": manifest.product,
+        "version": manifest.version,
+        "created": manifest.created,
+        "identity": dict(manifest.identity),
+        "coverage": {
+            "latitude": [lattice.south, lattice.north],
+            "longitude": [_wrapped(lattice.west), _wrapped(lattice.east)],
+        },
+        "spacing_deg": [lattice.latitude_spacing, lattice.longitude_spacing],
+        "nodes": [lattice.rows + 1, lattice.columns + 1],
+        "tiles": len(manifest.tiles),
+        "heights_m": list(manifest.heights_m),
+        "height_reference": manifest.height_reference,
+        "takes_ellipsoidal_height": manifest.takes_ellipsoidal_height,
+        "uncertainty": {name: _range_by_level(manifest, name) for name in _UNCERTAINTIES},
+        "flag_fractions": _flag_fractions(manifest),
+        "sizes": _sizes(manifest),
+        "inputs": [{"id": i.id, "licence": i.licence, "role": i.role} for i in manifest.inputs],
+        "manifest_digest": manifest.manifest_digest,
+    }
+
+
+def _wrapped(longitude: float) -> float:
+    return (longitude + 180.0) % 360.0 - 180.0
+
+
+def _range_by_level(manifest: Manifest, name: str) -> list[list[float]]:
+    """Smallest and largest value of a variable at every level."""
+    tiles = [tile.statistics[name] for tile in manifest.tiles.values()]
+    return [
+        [min(t["minimum"][level] for t in tiles), max(t["maximum"][level] for t in tiles)]
+        for level in range(len(manifest.heights_m))
+    ]
+
+
+def _flag_fractions(manifest: Manifest) -> dict[str, float]:
+    """Share of core nodes with each flag: tiles weigh by the nodes that they own."""
+    total = 0
+    flagged: dict[str, float] = {}
+    for (row, column), tile in manifest.tiles.items():
+        rows, columns = manifest.lattice.core(row, column)
+        total += rows * columns
+        for name, share in tile.flag_fractions.items():
+            flagged[name] = flagged.get(name, 0.0) + share * rows * columns
+    return {name: nodes / total for name, nodes in flagged.items()}
+
+
+def _sizes(manifest: Manifest) -> dict[str, int]:
+    sizes: dict[str, int] = {}
+    for file in manifest.files:
+        sizes[file.role] = sizes.get(file.role, 0) + file.size
+    return {**dict(sorted(sizes.items())), "total": sum(sizes.values())}
+
+
+def _print_described(about: dict[str, Any], folder: Path) -> None:
+    south, north = about["coverage"]["latitude"]
+    west, east = about["coverage"]["longitude"]
+    rows, columns = about["nodes"]
+    identity = about["identity"]
+    lines = {
+        "release": f"{about['product']} {about['version']}",
+        "created": about["created"] or "not stated (SOURCE_DATE_EPOCH was not set)",
+        "anomaly": identity["anomaly_definition"],
+        "reference": f"{identity['reference_field']} at {identity['reference_epoch']}",
+        "coverage": f"latitude {south:.6g} to {north:.6g}, longitude {west:.6g} to {east:.6g}",
+        "spacing": "{:.6g} x {:.6g} degrees".format(*about["spacing_deg"]),
+        "nodes": f"{rows} x {columns} in {about['tiles']} tiles",
+        "height above": about["height_reference"].replace("_", " "),
+        "size": f"{about['sizes']['total'] / 1e6:.1f} MB",
+        "manifest": about["manifest_digest"],
+    }
+    for key, value in lines.items():
+        print(f"{key:<14}{value}")
+    print()
+    _print_levels(about)
+    print()
+    shares = [(f"{share:.2%}", name) for name, share in about["flag_fractions"].items()]
+    print_table(("nodes", "flag"), shares)
+    print()
+    inputs = [(i["id"], i["role"], i["licence"]) for i in about["inputs"]]
+    print_table(("input", "role", "licence"), inputs)
+    _print_next(about, folder)
+
+
+def _print_levels(about: dict[str, Any]) -> None:
+    rows = []
+    for level, height in enumerate(about["heights_m"]):
+        ranges = [about["uncertainty"][name][level] for name in _UNCERTAINTIES]
+        rows.append((f"{height:g}", *(f"{low:.3g} to {high:.3g}" for low, high in ranges)))
+    titles = [
+        f"{name.removesuffix('_uncertainty').replace('_', ' ')} 1 sigma, {unit}"
+        for name, unit in _UNCERTAINTIES.items()
+    ]
+    print_table(("level m", *titles), rows)
+
+
+def _print_next(about: dict[str, Any], folder: Path) -> None:
+    south, north = about["coverage"]["latitude"]
+    west, east = about["coverage"]["longitude"]
+    middle = (south + north) / 2.0, _wrapped(west + ((east - west) % 360.0) / 2.0)
+    height = about["heights_m"][-1]
+    print("\nnext:")
+    print(f"  magtiles validate {folder}")
+    print(f"  magtiles plot {folder} --out map.png")
+    print(
+        f"  magtiles query {folder} --lat {middle[0]:.5g} --lon {middle[1]:.6g}"
+        f" --height {height:g}" + _height_option(about)
+    )
+
+
+def _height_option(about: dict[str, Any]) -> str:
+    return "" if about["takes_ellipsoidal_height"] else " --height-above-reference"

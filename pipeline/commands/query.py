@@ -1,0 +1,190 @@
+"""Ask a release for the anomaly at positions. Heights are metres above the WGS84 ellipsoid."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import csv
+import sys
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtiles.catalog.flags import QualityFlag
+from magtiles.pipeline.output import print_json, print_table
+from magtiles.schemas.errors import FormatError, UsageError
+
+HELP = "print the anomaly, its uncertainty and flags at positions"
+NEEDS_PIPELINE = False
+
+_CORE = ("north", "east", "down", "horizontal", "total", "declination", "inclination")
+_COLUMNS = ("latitude", "longitude", "height")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``magtiles query``."""
+    parser.add_argument("release", type=Path, metavar="RELEASE", help="folder of a release")
+    for option, meaning in (
+        ("--lat", "geodetic latitudes, degrees north"),
+        ("--lon", "longitudes, degrees east"),
+        ("--height", "heights, metres above the WGS84 ellipsoid"),
+    ):
+        parser.add_argument(
+            option,
+            type=_numbers,
+            nargs="+",
+            action="extend",
+            default=[],
+            metavar="NUMBER",
+            help=f"{meaning}; several by spaces or commas; one serves all positions",
+        )
+    parser.add_argument(
+        "--positions",
+        metavar="FILE.csv",
+        help="CSV with a header latitude,longitude,height; - reads it from stdin",
+    )
+    parser.add_argument(
+        "--height-above-reference",
+        action="store_true",
+        help="heights count from the release's own surface (terrain or sea level) instead",
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON; missing is null")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Answer every position, in order; NaN where the release does not know."""
+    positions = _positions(arguments)
+    answers = answer(arguments.release, positions, above_reference=arguments.height_above_reference)
+    if arguments.json:
+        print_json(answers[0] if _is_single(arguments) else answers)
+    else:
+        _print_answers(answers)
+    return 0
+
+
+def answer(
+    folder: Path, positions: NDArray[np.float64], *, above_reference: bool
+) -> list[dict[str, Any]]:
+    """What a release says at positions (n, 3): latitude, longitude (deg) and height (m).
+
+    Core field keys are None: a release is asked without a date.
+    """
+    from magtiles.catalog import open_release
+
+    latitude, longitude, height = positions.T
+    place: dict[str, Any] = {"latitude": latitude, "longitude": longitude}
+    place["height_above_reference" if above_reference else "height"] = height
+    anomaly = open_release(folder).anomaly
+    total = anomaly.total(**place)
+    vector = anomaly.vector(**place)
+    uncertainty = anomaly.uncertainty(**place)
+    flags = anomaly.flags(**place)
+    return [
+        {
+            **dict(zip(_COLUMNS, map(float, positions[i]), strict=True)),
+            **dict.fromkeys(_CORE),
+            "anomaly": float(total[i]),
+            "anomaly_north": float(vector[i, 0]),
+            "anomaly_east": float(vector[i, 1]),
+            "anomaly_down": float(vector[i, 2]),
+            "uncertainty": float(uncertainty[i]),
+            "flags": flag_names(int(flags[i])),
+        }
+        for i in range(len(positions))
+    ]
+
+
+def flag_names(bits: int) -> list[str]:
+    """Names of the bits that are set, as CF writes them."""
+    return [str(flag.name).lower() for flag in QualityFlag if flag & bits]
+
+
+def _is_single(arguments: argparse.Namespace) -> bool:
+    values = (arguments.lat, arguments.lon, arguments.height)
+    return arguments.positions is None and all(sum(map(len, v)) == 1 for v in values)
+
+
+def _positions(arguments: argparse.Namespace) -> NDArray[np.float64]:
+    given = {
+        "--lat": [n for numbers in arguments.lat for n in numbers],
+        "--lon": [n for numbers in arguments.lon for n in numbers],
+        "--height": [n for numbers in arguments.height for n in numbers],
+    }
+    if arguments.positions is not None:
+        if any(given.values()):
+            raise UsageError("given together with --lat, --lon, --height", where="--positions")
+        with _opened(arguments.positions) as (file, name):
+            return read_positions(file, name)
+    for option, numbers in given.items():
+        if not numbers:
+            raise UsageError("no positions", where=option, remedy="give it, or --positions")
+    count = max(len(numbers) for numbers in given.values())
+    for option, numbers in given.items():
+        if len(numbers) not in (1, count):
+            raise UsageError(f"{len(numbers)} numbers", where=option, expected=f"1 or {count}")
+    columns = [np.broadcast_to(np.array(numbers), count) for numbers in given.values()]
+    return np.column_stack(columns)
+
+
+@contextlib.contextmanager
+def _opened(name: str) -> Iterator[tuple[TextIO, str]]:
+    if name == "-":
+        yield sys.stdin, "<stdin>"
+        return
+    with open(name, encoding="utf-8-sig", newline="") as file:
+        yield file, name
+
+
+def read_positions(file: Iterable[str], name: str) -> NDArray[np.float64]:
+    """Positions (n, 3) from CSV lines with a header; other columns are passed over.
+
+    Raises FormatError naming file, line and column.
+    """
+    rows = csv.DictReader(file, skipinitialspace=True)
+    missing = [c for c in _COLUMNS if c not in (rows.fieldnames or ())]
+    if missing:
+        raise FormatError(
+            f"no column '{missing[0]}'",
+            where=f"{name} line 1",
+            expected=f"a header with {', '.join(_COLUMNS)}",
+        )
+    table = [[_cell(row, column, name, rows.line_num) for column in _COLUMNS] for row in rows]
+    if not table:
+        raise FormatError("no positions", where=name, expected="a line for each below the header")
+    return np.array(table, dtype=np.float64)
+
+
+def _cell(row: dict[str, str | None], column: str, name: str, line: int) -> float:
+    text = row[column]
+    try:
+        return float(text or "")
+    except ValueError:
+        raise FormatError(
+            f"{column} is {text!r}", where=f"{name} line {line}", expected="a number"
+        ) from None
+
+
+def _numbers(text: str) -> list[float]:
+    try:
+        return [float(part) for part in text.strip().strip(",").split(",")]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number, or a list of them") from None
+
+
+def _print_answers(answers: list[dict[str, Any]]) -> None:
+    header = ("latitude", "longitude", "height m", "anomaly nT", "north", "east", "down")
+    rows = [
+        (
+            f"{a['latitude']:.6f}",
+            f"{a['longitude']:.6f}",
+            f"{a['height']:.1f}",
+            *(f"{a[k]:.2f}" for k in ("anomaly", "anomaly_north", "anomaly_east", "anomaly_down")),
+            f"{a['uncertainty']:.2f}",
+            " ".join(a["flags"]) or "-",
+        )
+        for a in answers
+    ]
+    print_table((*header, "1 sigma", "flags"), rows)
