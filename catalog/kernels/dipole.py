@@ -11,7 +11,7 @@ Floats = NDArray[np.float64]
 
 _MU0_4PI = 100.0  # 1e-7 T m/A in nT m/A
 _PER_KM = 1e3
-_PAIRS = 500_000  # point-dipole pairs at once: their arrays stay in cache
+_PAIRS = 50_000  # point-dipole pairs at once: their arrays stay in cache
 
 TENSOR = ("nn", "ne", "nd", "ee", "ed")
 """Order of the five independent tensor components; dd = -(nn + ee)."""

@@ -16,7 +16,7 @@ from magtiles.schemas.errors import FormatError, SourceError
 from magtiles.stages.ingest.raw import RawGrid, is_magnetic
 from magtiles.stages.ingest.source import IngestGridParams
 
-_MAX_NODES = 400_000_000  # 3.2 GB of float64: a small file can declare any size
+_DEFLATE_LIMIT = 1032  # the most zlib can expand: a file that declares more holds none of it
 
 _METRES = {"m": 1.0, "metre": 1.0, "meter": 1.0, "metres": 1.0, "meters": 1.0}
 _METRES |= {"km": 1000.0, "kilometre": 1000.0, "kilometer": 1000.0}
@@ -59,9 +59,12 @@ def _read(dataset: xr.Dataset, path: Path, params: IngestGridParams) -> RawGrid:
     name = _choose_variable(dataset, path, params)
     where = f"{path.name} variable '{name}'"
     variable = dataset[name]
-    if variable.size > _MAX_NODES:
+    size = path.stat().st_size
+    if variable.nbytes > _DEFLATE_LIMIT * size:
         raise FormatError(
-            f"declares {variable.size} values", where=where, expected=f"at most {_MAX_NODES}"
+            f"declares {variable.nbytes} bytes in a file of {size}",
+            where=where,
+            remedy="fetch it again",
         )
     y_dim, x_dim = _axes(dataset, variable, where)
     flat = variable.squeeze([d for d in variable.dims if d not in (y_dim, x_dim)], drop=True)
