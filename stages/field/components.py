@@ -1,0 +1,206 @@
+"""Total, vector and tensor of a magnetic anomaly at one height, in true north, east, down."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from magtiles.catalog.flags import QualityFlag, flag_attributes
+from magtiles.schemas.errors import ContractError, CoverageError
+from magtiles.stages.crs import WGS84
+from magtiles.stages.declare import Params, Stage, quantity
+from magtiles.stages.field.direction import Ambient, AmbientSource
+from magtiles.stages.field.interpolate import evaluate_linear, evaluate_spline
+from magtiles.stages.field.prepare import PlaneMap, prepare
+from magtiles.stages.field.rotation import rotate_to_ned
+from magtiles.stages.field.solve import AnomalousField, solve
+from magtiles.stages.field.spectral import (
+    LOW_INCLINATION_SINE,
+    TENSOR,
+    VECTOR,
+    oversampled_spline,
+)
+from magtiles.stages.field.target import Axis, Nodes, Target, geographic_target, locate, own_target
+from magtiles.stages.field.uncertainty import uncertainty
+
+Single = NDArray[np.float32]
+
+PRODUCTS = (
+    "magnetic_anomaly", "anomaly_north", "anomaly_east", "anomaly_down",
+    "gradient_nn", "gradient_ne", "gradient_nd", "gradient_ee", "gradient_ed",
+)  # fmt: skip
+SIGMAS = {
+    "magnetic_anomaly_uncertainty": "total",
+    "vector_uncertainty": "vector",
+    "tensor_uncertainty": "tensor",
+}
+_OVERSAMPLING = 2
+_DROPPED = ("datum_pipeline", "datum_operation", "datum_accuracy_m", "allow_ballpark_datum")
+
+
+class DeriveComponentsParams(Params):
+    """Parameters of derive-components."""
+
+    height_m: float = quantity("m", default=0.0, doc="Height gain above the input surface.")
+    allow_downward_continuation: bool = quantity(
+        "1", default=False, doc="Permit a negative height gain, which amplifies noise."
+    )
+    inclination_deg: float | None = quantity(
+        "degree",
+        default=None,
+        ge=-90,
+        le=90,
+        doc="Ambient inclination; default the reference field's at its epoch.",
+    )
+    declination_deg: float | None = quantity(
+        "degree", default=None, ge=-180, le=180, doc="Ambient declination, with inclination_deg."
+    )
+    latitude: Axis | None = quantity(
+        "degrees_north",
+        default=None,
+        doc="Output nodes: first, spacing, count (WGS84); default the input's own nodes.",
+    )
+    longitude: Axis | None = quantity(
+        "degrees_east", default=None, doc="Output nodes, with latitude: first, spacing, count."
+    )
+
+
+def derive_components(grid: xr.Dataset, *, params: DeriveComponentsParams) -> xr.Dataset:
+    """Nine products of a filled anomaly grid, `height_m` higher, with uncertainty and flags.
+
+    Fourier transform on a near-true-scale plane: continuation upward, vector (Mount 2018,
+    eq. 90-98) and tensor, resampled by zero-padding the spectrum twofold, splined to the
+    output nodes and turned from grid to true north. The mean of the map, which carries
+    no vector information, is given the vector that sources without strike would have.
+
+    Input anomaly-grid/1 (rows, columns) without voids; output component-grid/1 on
+    its own nodes or on (latitude, longitude): nT, nT/km, NED.
+    Raises ContractError for voids, CoverageError for a level below the survey without
+    permission, ParameterError when only one of two angles or axes is given.
+    """
+    _permit(grid, params)
+    plane_map = prepare(grid)
+    ambient = AmbientSource(grid, params.inclination_deg, params.declination_deg)
+    field = solve(plane_map, ambient, params.height_m)
+    if params.latitude is not None and params.longitude is not None:
+        target = geographic_target(params.latitude, params.longitude)
+    else:
+        target = own_target(grid, plane_map)
+    nodes = locate(target, plane_map, ambient)
+    products = evaluate_products(field, nodes, params.height_m)
+    sigmas = uncertainty(grid, plane_map, field, params.height_m, nodes.row, nodes.column)
+    flags = quality_flags(plane_map, nodes, params.height_m)
+    return _assemble(grid, target, nodes, params.height_m, products, sigmas, flags)
+
+
+def evaluate_products(field: AnomalousField, nodes: Nodes, height_gain: float) -> Single:
+    """The nine products (9, m, n) in NED at the nodes, in the order of `PRODUCTS`."""
+    out = np.empty((len(PRODUCTS), *nodes.row.shape), np.float32)
+    w, offset = field.wavenumbers, field.padding.offset
+    first = int((nodes.row.min() + offset[0]) * _OVERSAMPLING) - 2
+    last = int((nodes.row.max() + offset[0]) * _OVERSAMPLING) + 4
+    rows = slice(max(first, 0), max(min(last, w.shape[0] * _OVERSAMPLING), 8))
+    shift = np.array([offset[0] * _OVERSAMPLING - rows.start, offset[1] * _OVERSAMPLING], float)
+    potential = field.potential_at(height_gain)
+    for product, values in zip(("total", *VECTOR, *TENSOR), out, strict=True):
+        if product == "total":
+            spectrum = field.total_at(height_gain)
+        else:
+            spectrum = field.component(potential, product)
+        coefficients = oversampled_spline(spectrum, w, rows, _OVERSAMPLING)
+        evaluate_spline(coefficients, nodes.row, nodes.column, float(_OVERSAMPLING), shift, values)
+    rotate_to_ned(out, nodes.north, nodes.ambient, np.array(field.inversion.direction))
+    return out
+
+
+def quality_flags(plane_map: PlaneMap, nodes: Nodes, height_gain: float) -> NDArray[np.uint8]:
+    """Flags (m, n): gaps grown by the height gained, at least by the cell that reaches them."""
+    cell = max(plane_map.spacing) * (1 - 1e-6)
+    reach = max(abs(height_gain), cell)
+    flags = np.zeros(nodes.row.shape, np.uint8)
+    near = np.empty(nodes.row.shape, np.float32)
+    if plane_map.void.any():
+        distance = plane_map.distance(plane_map.void, outside=False)
+        evaluate_linear(distance, nodes.row, nodes.column, 1.0, 0.0, near)
+        flags[near < reach] |= np.uint8(QualityFlag.VOID_FILLED)
+    distance = plane_map.distance(plane_map.beyond, outside=True)
+    evaluate_linear(np.pad(distance, 1), nodes.row, nodes.column, 1.0, 1.0, near)
+    flags[near < reach] |= np.uint8(QualityFlag.BEYOND_COVERAGE)
+    if height_gain < 0:
+        flags |= np.uint8(QualityFlag.DOWNWARD_CONTINUED)
+    flags[np.abs(nodes.ambient[2]) < LOW_INCLINATION_SINE] |= np.uint8(
+        QualityFlag.REDUCED_ACCURACY_DIRECTION
+    )
+    return flags
+
+
+def _permit(grid: xr.Dataset, params: DeriveComponentsParams) -> None:
+    if params.height_m < 0 and not params.allow_downward_continuation:
+        raise CoverageError(
+            f"a level {-params.height_m:g} m below the survey",
+            where=grid.attrs.get("source"),
+            expected="levels at or above the survey surface",
+            remedy="raise it, or set allow_downward_continuation = true (flagged, noisier)",
+        )
+    if (params.latitude is None) != (params.longitude is None):
+        raise CoverageError(
+            "output nodes are given along one axis only", expected="both latitude and longitude"
+        )
+    if grid["height"].ndim:
+        raise ContractError(
+            "the survey's height differs from node to node",
+            where="height",
+            expected="one height above height_reference",
+            remedy="state a drape's height above terrain",
+        )
+
+
+def _assemble(
+    grid: xr.Dataset,
+    target: Target,
+    nodes: Nodes,
+    height_gain: float,
+    products: Single,
+    sigmas: dict[str, NDArray[np.float64]],
+    flags: NDArray[np.uint8],
+) -> xr.Dataset:
+    dims = target.dims
+
+    def field(values: NDArray[Any], units: str) -> tuple[Any, ...]:
+        return dims, values.astype(np.float32, copy=False), {"units": units, "grid_mapping": "crs"}
+
+    variables: dict[str, Any] = {
+        name: field(values, "nT km-1" if name.startswith("gradient") else "nT")
+        for name, values in zip(PRODUCTS, products, strict=True)
+    }
+    for name, group in SIGMAS.items():
+        variables[name] = field(sigmas[group], "nT km-1" if group == "tensor" else "nT")
+    for axis, values in zip(("north", "east", "down"), nodes.ambient, strict=True):
+        variables[f"ambient_{axis}"] = field(values, "1")
+    variables["quality_flag"] = (dims, flags, flag_attributes() | {"grid_mapping": "crs"})
+    height = grid["height"]
+    variables["height"] = ((), float(height) + height_gain, height.attrs)
+    variables["crs"] = grid["crs"] if dims[0] == "y" else ((), np.int32(0), WGS84.to_cf())
+    units = ("m", "m") if dims[0] == "y" else ("degrees_north", "degrees_east")
+    coordinates = {
+        name: ((name,), values, {"units": unit})
+        for name, values, unit in zip(dims, (target.rows, target.columns), units, strict=True)
+    }
+    middle = Ambient(*(np.asarray(part.mean(dtype=float)) for part in nodes.ambient))
+    attributes = {k: v for k, v in grid.attrs.items() if k not in _DROPPED or dims[0] == "y"}
+    attributes["ambient_inclination_deg"] = float(middle.inclination_deg)
+    attributes["ambient_declination_deg"] = float(middle.declination_deg)
+    return xr.Dataset(variables, coords=coordinates, attrs=attributes)
+
+
+STAGE = Stage(
+    name="derive-components",
+    version=1,
+    params=DeriveComponentsParams,
+    inputs={"grid": "anomaly-grid/1"},
+    output="component-grid/1",
+    run=derive_components,
+)

@@ -1,0 +1,82 @@
+"""The direction of the ambient field that a total-field anomaly is measured along."""
+
+from __future__ import annotations
+
+import datetime
+from typing import NamedTuple
+
+import numpy as np
+import ppigrf
+import xarray as xr
+from numpy.typing import NDArray
+
+from magtiles.schemas.errors import ParameterError
+
+Real = NDArray[np.float64]
+
+_METRES_PER_KM = 1000.0
+
+
+class Ambient(NamedTuple):
+    """Unit vector of the ambient field in true NED; each part of the positions' shape."""
+
+    north: Real
+    east: Real
+    down: Real
+
+    @property
+    def inclination_deg(self) -> Real:
+        """Angle below the horizontal, degrees."""
+        return np.asarray(np.degrees(np.arctan2(self.down, np.hypot(self.north, self.east))))
+
+    @property
+    def declination_deg(self) -> Real:
+        """Angle of the horizontal part, east of true north, degrees."""
+        return np.asarray(np.degrees(np.arctan2(self.east, self.north)))
+
+
+def from_angles(inclination_deg: float, declination_deg: float, shape: tuple[int, ...]) -> Ambient:
+    """One direction everywhere (Mount 2018, eq. 96-98)."""
+    i, d = np.radians([inclination_deg, declination_deg])
+    parts = np.cos(i) * np.cos(d), np.cos(i) * np.sin(d), np.sin(i)
+    return Ambient(*(np.full(shape, part) for part in parts))
+
+
+def igrf_direction(
+    latitude: Real, longitude: Real, height_m: float, date: datetime.datetime
+) -> Ambient:
+    """Direction of the IGRF at WGS84 positions (degrees) and ellipsoidal height, any shape."""
+    east, north, up = (
+        np.asarray(part)[0]
+        for part in ppigrf.igrf(longitude, latitude, height_m / _METRES_PER_KM, date)
+    )
+    strength = np.sqrt(east**2 + north**2 + up**2)
+    return Ambient(north / strength, east / strength, -up / strength)
+
+
+class AmbientSource:
+    """Where the ambient direction of a map comes from: given angles, or the IGRF at its epoch.
+
+    Whatever its generation, a reference field's direction agrees within some hundredths of a
+    degree, so the newest IGRF (definitive for past epochs) stands for all of them.
+    Raises ParameterError if only one of the two angles is given.
+    """
+
+    def __init__(
+        self, grid: xr.Dataset, inclination_deg: float | None, declination_deg: float | None
+    ) -> None:
+        if (inclination_deg is None) != (declination_deg is None):
+            raise ParameterError(
+                "only one of inclination_deg and declination_deg is given",
+                remedy="give both, or neither to use the reference field at its epoch",
+            )
+        self._angles = inclination_deg, declination_deg
+        self._date = datetime.datetime.fromisoformat(grid.attrs["reference_epoch"])
+        self._height = float(np.mean(grid["height"].values))
+
+    def at(self, latitude: Real, longitude: Real) -> Ambient:
+        """The direction at WGS84 positions (degrees), of their shape."""
+        inclination, declination = self._angles
+        if inclination is not None and declination is not None:
+            return from_angles(inclination, declination, np.shape(latitude))
+        return igrf_direction(latitude, longitude, self._height, self._date)

@@ -1,0 +1,190 @@
+"""Fourier-domain relations between a total-field anomaly and its potential, vector and tensor.
+
+Axes are those of a plane: y (grid north), x (grid east) and d (down). Outside its sources the
+anomalous field is the gradient of a harmonic potential, B = grad(phi), so that with wavenumbers
+k_y, k_x and k = |k| every product is phi's spectrum times a factor (Mount 2018, eq. 90-98)::
+
+    B_y, B_x, B_d   = i k_y, i k_x, k
+    G_ij = d_i B_j  = the products of two of these,   G_dd = -(G_yy + G_xx)
+    total T = f.B   = k f_d + i (k_y f_y + k_x f_x)   (the bracket of eq. 93-95)
+
+with f the unit vector of the ambient field. Continuation upward by h multiplies by exp(-k h).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+Real = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+VECTOR = ("y", "x", "d")
+TENSOR = ("yy", "yx", "yd", "xx", "xd")
+
+LOW_INCLINATION_SINE = np.sin(np.radians(20.0))
+"""Below this |sin I| the components are recovered with damping (and flagged)."""
+_DAMPING = 0.1
+
+_METRES_PER_KM = 1000.0
+_WORKERS = -1
+
+
+@dataclass(frozen=True)
+class Wavenumbers:
+    """Angular wavenumbers (rad/m) of the real transform of `shape` samples `spacing` (y, x) apart.
+
+    Both sizes must be odd: a Nyquist term would make odd derivatives ambiguous.
+    """
+
+    shape: tuple[int, int]
+    spacing: tuple[float, float]
+
+    @cached_property
+    def y(self) -> Real:
+        """Along y, shape (ny, 1)."""
+        return 2 * np.pi * scipy.fft.fftfreq(self.shape[0], self.spacing[0])[:, None]
+
+    @cached_property
+    def x(self) -> Real:
+        """Along x, shape (1, nx // 2 + 1)."""
+        return 2 * np.pi * scipy.fft.rfftfreq(self.shape[1], self.spacing[1])[None, :]
+
+    @cached_property
+    def k(self) -> Real:
+        """Magnitude, shape (ny, nx // 2 + 1)."""
+        return np.hypot(self.y, self.x)
+
+    @cached_property
+    def multiplicity(self) -> Real:
+        """How many terms of the full transform each column stands for, shape (1, nx // 2 + 1)."""
+        count = np.full(self.x.shape, 2.0)
+        count[0, 0] = 1.0
+        return count
+
+    def continuation(self, height_gain: float, noise_to_signal: float = 0.0) -> Real:
+        """exp(-k h); for h < 0 damped where it would amplify noise beyond the signal."""
+        factor = np.exp(-self.k * height_gain)
+        if height_gain < 0:
+            factor /= 1.0 + noise_to_signal * factor**2
+        return factor
+
+
+@dataclass(frozen=True)
+class Inversion:
+    """From total-field anomaly to potential, for one ambient direction f = (f_y, f_x, f_d).
+
+    Near zero inclination the factor k f_d + i k.f vanishes along a wedge of directions;
+    there its inverse is damped (Tikhonov, `damping` relative to k).
+    """
+
+    wavenumbers: Wavenumbers
+    direction: tuple[float, float, float]
+
+    @property
+    def damping(self) -> float:
+        """Relative damping; 0 away from low inclination."""
+        return _DAMPING if abs(self.direction[2]) < LOW_INCLINATION_SINE else 0.0
+
+    @property
+    def theta(self) -> Complex:
+        """Total anomaly over potential, k f_d + i k.f (rad/m)."""
+        w, (fy, fx, fd) = self.wavenumbers, self.direction
+        theta = np.empty(w.k.shape, np.complex128)
+        np.multiply(w.k, fd, out=theta.real)
+        np.add(w.y * fy, w.x * fx, out=theta.imag)
+        return theta
+
+    @cached_property
+    def potential(self) -> Complex:
+        """Potential over total anomaly (m); 0 at the zero wavenumber."""
+        theta = self.theta
+        power = theta.real**2 + theta.imag**2
+        if self.damping:
+            power += (self.damping * self.wavenumbers.k) ** 2
+        power[0, 0] = np.inf
+        return np.asarray(np.conj(theta) / power)
+
+    @property
+    def mean_vector(self) -> tuple[float, float, float]:
+        """Anomaly vector (y, x, d) per unit of mean total anomaly.
+
+        The zero wavenumber of a map says nothing of the vector. Given is the least-squares
+        estimate for sources without preferred strike: correlation of each component with the
+        total, averaged over azimuth; its projection on f is the mean itself.
+        """
+        fy, fx, fd = self.direction
+        power = (fy**2 + fx**2) / 2 + fd**2
+        return fy / 2 / power, fx / 2 / power, fd / power
+
+
+def factors(w: Wavenumbers, product: str) -> Iterator[Complex | Real]:
+    """The factors (each broadcastable) whose product takes phi to `product`, in SI per metre."""
+    for axis in product:
+        yield w.k if axis == "d" else 1j * (w.y if axis == "y" else w.x)
+
+
+def product_spectrum(
+    potential: Complex, w: Wavenumbers, product: str, scratch: Complex | None = None
+) -> Complex:
+    """Spectrum of a vector (nT) or tensor (nT/km) component from that of the potential (nT m)."""
+    scale = _METRES_PER_KM if len(product) == 2 else 1.0
+    first, *rest = factors(w, product)
+    if product in ("yy", "yx", "xx"):
+        # Both factors are imaginary: their product is real and cheaper.
+        real = -scale * (w.y if product[0] == "y" else w.x)
+        out = np.multiply(potential, real, out=scratch)
+        return np.multiply(out, w.y if product[1] == "y" else w.x, out=out)
+    out = np.multiply(potential, first * scale, out=scratch)
+    for factor in rest:
+        np.multiply(out, factor, out=out)
+    return out
+
+
+def forward(values: Real, shape: tuple[int, int] | None = None) -> Complex:
+    """Real two-dimensional transform, of `values` extended by zeros to `shape`."""
+    return np.asarray(scipy.fft.rfft2(values, s=shape, workers=_WORKERS))
+
+
+def inverse(spectrum: Complex, shape: tuple[int, int], rows: slice, columns: slice) -> Real:
+    """The inverse transform, computed only for `rows`, returned for `columns`. Overwrites input."""
+    partial = scipy.fft.ifft(spectrum, axis=0, overwrite_x=True, workers=_WORKERS)[rows]
+    values = scipy.fft.irfft(partial, n=shape[1], axis=1, workers=_WORKERS)
+    return np.asarray(values[:, columns])
+
+
+def oversampled_spline(spectrum: Complex, w: Wavenumbers, rows: slice, factor: int = 2) -> Real:
+    """Cubic B-spline coefficients of a field sampled `factor` times denser than its transform.
+
+    Zero-padding the spectrum resamples a band-limited field without loss; the spline's
+    prefilter is a division in the same domain (exact for the periodic field), so that the
+    coefficients cost no further pass. `rows` counts rows of the dense lattice.
+    """
+    ny = w.shape[0]
+    dense = ny * factor, w.shape[1] * factor
+    scale = factor**2 / (
+        _spline_symbol(w.y * w.spacing[0] / factor) * _spline_symbol(w.x * w.spacing[1] / factor)
+    )
+    half = (ny + 1) // 2
+    padded = np.zeros((dense[0], spectrum.shape[1]), np.complex128)
+    np.multiply(spectrum[:half], scale[:half], out=padded[:half])
+    np.multiply(spectrum[half:], scale[half:], out=padded[half - ny :])
+    return inverse(padded, dense, rows, slice(None))
+
+
+def _spline_symbol(phase: Real) -> Real:
+    """Transfer of a cubic B-spline from coefficients to samples at `phase` rad per sample."""
+    return (2.0 + np.cos(phase)) / 3.0
+
+
+def odd_fast_length(minimum: int) -> int:
+    """The smallest odd transform length, at least `minimum`, with small prime factors."""
+    length = scipy.fft.next_fast_len(minimum, real=True)
+    while length % 2 == 0:
+        length = scipy.fft.next_fast_len(length + 1, real=True)
+    return int(length)

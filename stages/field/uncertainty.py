@@ -1,0 +1,112 @@
+"""One sigma of a continued map's own error, for total, vector and tensor.
+
+Three independent parts are added in quadrature: the survey's noise, carried through the
+transform's own gain; what its lines could not resolve (aliasing); and the want of data in voids
+and beyond the border.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from magtiles.stages.field.interpolate import evaluate_linear
+from magtiles.stages.field.missing import missing_data
+from magtiles.stages.field.prepare import PlaneMap
+from magtiles.stages.field.solve import AnomalousField
+from magtiles.stages.field.spectral import TENSOR, VECTOR, Inversion
+
+Real = NDArray[np.float64]
+
+GROUPS = ("total", "vector", "tensor")
+_FLOOR = {"total": 1e-3, "vector": 1e-3, "tensor": 1e-6}
+_PER_KM2 = 1e6
+
+
+def uncertainty(
+    grid: xr.Dataset,
+    plane_map: PlaneMap,
+    field: AnomalousField,
+    height_gain: float,
+    row: Real,
+    column: Real,
+) -> dict[str, Real]:
+    """Sigma of each product group at fractional rows and columns of the map.
+
+    "total" and "vector" in nT, "tensor" in nT/km; vector and tensor per component, rms over
+    the components. Shapes those of `row`.
+    """
+    missing = missing_data(plane_map, field, height_gain)
+    noise = noise_gain(field, height_gain)
+    alias = alias_gain(grid, field.inversion, height_gain)
+    survey = _sample(plane_map.sigma, row, column) ** 2
+    signal = float(np.var(plane_map.values[~(plane_map.void | plane_map.beyond)]))
+    return {
+        group: np.sqrt(
+            survey * noise[group]
+            + signal * alias[group]
+            + missing.at(group, row, column)
+            + _FLOOR[group] ** 2
+        )
+        for group in GROUPS
+    }
+
+
+def noise_gain(field: AnomalousField, height_gain: float) -> dict[str, float]:
+    """Variance of each group per unit variance of white noise on the map's nodes (Parseval)."""
+    w = field.wavenumbers
+    lift = w.continuation(height_gain, field.noise_to_signal) ** 2 * w.multiplicity
+    potential = np.abs(field.inversion.potential) ** 2 * lift
+    y2, x2, k2 = w.y**2, w.x**2, w.k**2
+    count = w.shape[0] * w.shape[1]
+    return {
+        "total": float(lift.sum()) / count,
+        "vector": float((potential * k2).sum()) * 2 / len(VECTOR) / count,
+        "tensor": float((potential * (2 * k2**2 - y2 * x2)).sum()) * _PER_KM2 / len(TENSOR) / count,
+    }
+
+
+def alias_gain(grid: xr.Dataset, inversion: Inversion, height_gain: float) -> dict[str, float]:
+    """Variance of each group per unit variance of the anomaly, from structure between the lines.
+
+    At a height h over its sources a field's power falls as exp(-2 k h), so that the fraction
+    exp(-2 pi h / dx) lies beyond the Nyquist wavenumber K = pi / dx of lines dx apart (Canciani
+    and Raquet 2016, eq. 1). It is folded to 2K - k and continued upward from there.
+    Zero where the grid does not state `line_spacing_m` and `source_distance_m`.
+    """
+    if "line_spacing_m" not in grid.attrs or "source_distance_m" not in grid.attrs:
+        return dict.fromkeys(GROUPS, 0.0)
+    spacing, distance = float(grid.attrs["line_spacing_m"]), float(grid.attrs["source_distance_m"])
+    nyquist = np.pi / spacing
+    k = nyquist * (np.arange(400) + 0.5) / 400
+    folded = np.exp(-2 * (nyquist - k) * distance)
+    weight = folded / folded.sum() * np.exp(-2 * nyquist * distance)
+    lifted = weight * np.exp(-2 * k * height_gain)
+    ring = _ring(inversion)
+    return {
+        "total": float(lifted.sum()),
+        "vector": float(lifted.sum()) * ring["vector"],
+        "tensor": float((lifted * k**2).sum()) * ring["tensor"] * _PER_KM2,
+    }
+
+
+def _ring(inversion: Inversion) -> dict[str, float]:
+    """Mean over azimuth of the vector's and (per k^2) the tensor's power, per power of total."""
+    azimuth = np.linspace(0, 2 * np.pi, 720, endpoint=False)
+    y, x = np.cos(azimuth), np.sin(azimuth)
+    fy, fx, fd = inversion.direction
+    power = fd**2 + (fy * y + fx * x) ** 2
+    gain = power / (power + inversion.damping**2) ** 2
+    return {
+        "vector": float(np.mean(gain)) * 2 / len(VECTOR),
+        "tensor": float(np.mean(gain * (2 - (y * x) ** 2))) / len(TENSOR),
+    }
+
+
+def _sample(sigma: Real, row: Real, column: Real) -> Real:
+    if sigma.ndim == 0:
+        return np.asarray(sigma)
+    out = np.empty(row.shape)
+    evaluate_linear(sigma, row, column, 1.0, 0.0, out)
+    return out
