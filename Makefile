@@ -36,7 +36,7 @@ tiles: $(RELEASES) ## Build and validate PRODUCT="a.toml b.toml" (default: the d
 $(RELEASES): release/%: % $(READY)
 	release=$$($(MAGTILES) build $* --store $(STORE)) && $(MAGTILES) validate "$$release"
 
-build/sample/demo.toml: $(READY)
+build/sample/demo.toml: pipeline/sample.py catalog/kernels/dipole.py $(READY)
 	$(MAGTILES) sample $(@D)
 
 test: $(READY) ## Run the tests
