@@ -80,7 +80,7 @@ def refuse_without_pipeline(environment: Environment) -> None:
 
 
 def position_in(release: Path) -> list[str]:
-    """Latitude, longitude and height of a place in the middle of a release, away from its borders."""
+    """Latitude, longitude and height of a place in the middle of a release."""
     manifest = json.loads((release / "manifest.json").read_text("utf-8"))
     tiles = [file for file in manifest["files"] if file["role"] == "tile"]
     tile = tiles[len(tiles) // 2]
