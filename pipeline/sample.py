@@ -16,7 +16,6 @@ import ppigrf
 import pyproj
 import rasterio
 import rasterio.io
-import rasterio.transform
 import xarray as xr
 from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike, NDArray
@@ -341,7 +340,7 @@ def _igrf(
 def _geotiff(sample: Sample) -> bytes:
     """The survey as a float32 GeoTIFF, northern row first."""
     spec, half = sample.spec, 0.5 * sample.spec.spacing_m
-    corner = (sample.x[0] - half, sample.y[-1] + half)
+    west, north = sample.x[0] - half, sample.y[-1] + half
     values = np.where(np.isnan(sample.anomaly), _NO_DATA, sample.anomaly)[::-1]
     with rasterio.io.MemoryFile() as memory:
         with memory.open(
@@ -351,7 +350,7 @@ def _geotiff(sample: Sample) -> bytes:
             count=1,
             dtype="float32",
             crs=spec.crs,
-            transform=rasterio.transform.from_origin(*corner, spec.spacing_m, spec.spacing_m),
+            transform=rasterio.Affine(spec.spacing_m, 0.0, west, 0.0, -spec.spacing_m, north),
             nodata=_NO_DATA,
             compress="deflate",
             predictor=3,

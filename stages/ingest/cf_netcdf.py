@@ -41,13 +41,28 @@ def read_cf(path: Path, params: IngestGridParams) -> RawGrid:
     Raises FormatError for a damaged file, missing or curvilinear coordinates; SourceError
     where the variable is not clear.
     """
+    return _read(_load(path), path, params)
+
+
+def _load(path: Path) -> xr.Dataset:
+    with path.open("rb") as file:
+        classic = file.read(3) == b"CDF"
+    # The netCDF library fills what a truncated classic file lacks with zeros; SciPy refuses it.
+    engine = "scipy" if classic else "netcdf4"
+    size = path.stat().st_size
     try:
         # xarray unpacks into float32, so packed integers are unpacked here in float64.
         with xr.open_dataset(
-            path, engine="netcdf4", mask_and_scale=False, decode_times=False
+            path, engine=engine, mask_and_scale=False, decode_times=False
         ) as dataset:
-            return _read(dataset, path, params)
-    except (OSError, RuntimeError, ValueError, KeyError, IndexError) as caught:
+            if dataset.nbytes > _DEFLATE_LIMIT * size:
+                raise FormatError(
+                    f"declares {dataset.nbytes} bytes of arrays in a file of {size}",
+                    where=path.name,
+                    remedy="fetch it again",
+                )
+            return dataset.load()
+    except (OSError, RuntimeError, ValueError, TypeError, LookupError) as caught:
         raise FormatError(
             f"is not a whole netCDF file: {str(caught).replace(str(path), path.name)}",
             where=path.name,
@@ -59,30 +74,23 @@ def _read(dataset: xr.Dataset, path: Path, params: IngestGridParams) -> RawGrid:
     name = _choose_variable(dataset, path, params)
     where = f"{path.name} variable '{name}'"
     variable = dataset[name]
-    size = path.stat().st_size
-    if variable.nbytes > _DEFLATE_LIMIT * size:
-        raise FormatError(
-            f"declares {variable.nbytes} bytes in a file of {size}",
-            where=where,
-            remedy="fetch it again",
-        )
     y_dim, x_dim = _axes(dataset, variable, where)
     flat = variable.squeeze([d for d in variable.dims if d not in (y_dim, x_dim)], drop=True)
     crs = _crs(dataset, variable, where)
     says = _stated(dataset, variable, x_dim)
-    mark = None if "no_data" in says else params.no_data
-    error_name = f"{name}_uncertainty"
     x, x_ulp = _nodes(dataset, x_dim, crs, where)
     y, y_ulp = _nodes(dataset, y_dim, crs, where)
     return RawGrid(
-        values=_unpacked(flat.transpose(y_dim, x_dim), mark),
+        values=_unpacked(
+            flat.transpose(y_dim, x_dim), None if "no_data" in says else params.no_data
+        ),
         x=x,
         y=y,
         x_ulp=x_ulp,
         y_ulp=y_ulp,
         crs=crs,
         says=says,
-        uncertainty=_uncertainty(dataset, error_name, (y_dim, x_dim)),
+        uncertainty=_uncertainty(dataset, f"{name}_uncertainty", (y_dim, x_dim)),
     )
 
 

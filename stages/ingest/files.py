@@ -16,7 +16,6 @@ _MAGIC = {
     b"\x89HDF": "netcdf",
     b"CDF\x01": "netcdf",
     b"CDF\x02": "netcdf",
-    b"CDF\x05": "netcdf",
 }
 _KNOWN_OTHERS = {
     b"PK\x03\x04": "a zip archive",

@@ -181,8 +181,10 @@ def _crs(header: dict[str, list[str]], path: Path) -> pyproj.CRS | None:
 def _standard_crs(path: Path) -> pyproj.CRS | None:
     try:
         with rasterio.open(path, driver="GXF") as dataset:
-            return pyproj.CRS.from_user_input(dataset.crs) if dataset.crs else None
-    except (RasterioError, CRSError) as caught:
+            # GDAL leaves the zero meridian nameless, and PROJ then does not know the datum.
+            wkt = dataset.crs.to_wkt().replace('PRIMEM["unnamed",0]', 'PRIMEM["Greenwich",0]')
+            return pyproj.CRS.from_wkt(wkt)
+    except (RasterioError, CRSError, AttributeError) as caught:  # no CRS at all is None
         _LOG.warning("%s: #MAP_PROJECTION is not understood (%s)", path.name, caught)
         return None
 
