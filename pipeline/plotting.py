@@ -126,7 +126,7 @@ class _Layout:
         legend_bottom = self._flags_top + side_height + 0.4 + 0.2 * legend_lines
         self._bar_top = map_bottom + 0.42
         self.height = max(self._bar_top + 1.0, legend_bottom + 0.3)
-        self._side_left = 0.75 + self._map_width + 0.95
+        self._side_left = 0.75 + self._map_width + 0.94
         self._width = self._side_left + self._side_width + 0.75
 
     @property
@@ -184,7 +184,7 @@ def _draw_map(
     picture[..., :3] = _lit(picture[..., :3], shade[..., np.newaxis])
     picture[np.isnan(values)] = (1.0, 1.0, 1.0, 0.0)
     smooth = "bilinear" if max(values.shape) < _SMOOTH_BELOW else "auto"
-    _show(axes, latitude, longitude, picture, interpolation=smooth)
+    _show(axes, latitude, longitude, picture, ticks=5, interpolation=smooth)
     beyond = (flags & QualityFlag.BEYOND_COVERAGE) != 0
     filled = (flags & QualityFlag.VOID_FILLED) != 0
     _outline(axes, latitude, longitude, beyond, "solid")
@@ -235,7 +235,7 @@ def hillshade(
 
 def _lit(colour: NDArray[np.float64], shade: NDArray[np.float64]) -> NDArray[np.float64]:
     # Flat ground keeps its colour exactly, so the colour bar stays true.
-    light = 1.1 * (shade - 0.5)
+    light = 0.9 * (shade - 0.5)
     lit: NDArray[np.float64] = np.where(
         light < 0, colour * (1.0 + light), colour + (1.0 - colour) * light
     )
@@ -247,14 +247,15 @@ def _show(
     latitude: NDArray[np.float64],
     longitude: NDArray[np.float64],
     image: NDArray[Any],
+    *,
+    ticks: int,
     **options: Any,
 ) -> Any:
     shown = axes.imshow(image, origin="lower", extent=_extent(longitude, latitude), **options)
     axes.set_aspect(1.0 / _cosine(latitude))
     axes.xaxis.set_major_formatter(lambda x, _: _degrees(x, "E", "W"))
     axes.yaxis.set_major_formatter(lambda y, _: _degrees(y, "N", "S"))
-    axes.locator_params(axis="x", nbins=5)
-    axes.locator_params(axis="y", nbins=6)
+    axes.locator_params(axis="both", nbins=ticks)
     axes.tick_params(labelsize=8, direction="out")
     return shown
 
@@ -325,7 +326,7 @@ def _draw_uncertainty(
     norm = LogNorm(low, high) if wide else Normalize(low, high)
     if even:
         norm = Normalize(0.9 * low, 1.1 * high)
-    drawn = _show(axes, latitude, longitude, uncertainty, cmap="cividis", norm=norm)
+    drawn = _show(axes, latitude, longitude, uncertainty, ticks=3, cmap="cividis", norm=norm)
     axes.set_title("uncertainty, 1 sigma", fontsize=9, loc="left")
     bar = axes.figure.colorbar(drawn, cax=bar_axes)
     if wide:
@@ -360,7 +361,7 @@ def _draw_flags(
         name = str(flag.name).lower().replace("_", " ")
         label = f"{name}, {marked.mean():.1%}"
         legend.append(Patch(fc=_FLAG_COLOURS[flag], ec="#888888", label=label))
-    _show(axes, latitude, longitude, picture, interpolation="nearest")
+    _show(axes, latitude, longitude, picture, ticks=3, interpolation="nearest")
     axes.set_title("quality flags", fontsize=9, loc="left")
     below_ticks = ScaledTranslation(0.0, -0.35, axes.figure.dpi_scale_trans)
     axes.legend(

@@ -26,7 +26,7 @@ def run(arguments: argparse.Namespace) -> int:
     from magtiles.pipeline.plotting import save_png
     from magtiles.pipeline.preview import release_figure
 
-    figure = release_figure(arguments.release, level=arguments.level, quantity=arguments.quantity)
+    figure = release_figure(arguments.release, height=arguments.level, quantity=arguments.quantity)
     save_png(figure, arguments.out)
     print(arguments.out)
     return 0

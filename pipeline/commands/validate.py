@@ -42,7 +42,7 @@ def _print_checks(checks: list[Check]) -> None:
             "-" if check.measured is None else f"{check.measured:.4g}",
             "-" if check.bound is None else f"{check.bound:.4g}",
             check.unit,
-            check.detail,
+            check.where,
         )
         for check in checks
     ]

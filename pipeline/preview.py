@@ -1,0 +1,99 @@
+"""Pictures of a release, from its tiles or from the arrays of a level."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtiles.catalog import open_release
+from magtiles.catalog.releases.lattice import HALO, Lattice
+from magtiles.catalog.releases.tile import TileData
+from magtiles.pipeline.plotting import QUANTITIES, preview_figure
+from magtiles.schemas.errors import UsageError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_SURFACES = {
+    "ellipsoid": "the WGS84 ellipsoid",
+    "mean_sea_level": "mean sea level",
+    "terrain": "terrain",
+}
+
+
+def release_figure(folder: Path, *, height: float | None, quantity: str) -> Figure:
+    """Draw one quantity of a release at one of its levels; None is the lowest.
+
+    Raises UsageError for a height that is no level, IntegrityError for a damaged release.
+    """
+    release = open_release(folder)
+    manifest = release.manifest
+    level = _level(manifest.heights_m, height)
+    kind = QUANTITIES[quantity]
+    names = (kind.variable, kind.uncertainty, "quality_flag")
+    values, uncertainty, flags = assemble_level(release.tiles(), manifest.lattice, level, names)
+    return preview_figure(
+        manifest.lattice.latitudes(np.arange(manifest.lattice.rows + 1)),
+        manifest.lattice.longitudes(np.arange(manifest.lattice.columns + 1)),
+        values,
+        uncertainty,
+        flags,
+        quantity=quantity,
+        title=figure_title(
+            manifest.product,
+            manifest.version,
+            quantity,
+            manifest.heights_m[level],
+            manifest.height_reference,
+        ),
+        note=figure_note(manifest.identity),
+    )
+
+
+def assemble_level(
+    tiles: Iterable[TileData], lattice: Lattice, level: int, names: Sequence[str]
+) -> list[NDArray[Any]]:
+    """Variables at one level on all core nodes, (rows + 1, columns + 1) each."""
+    whole: list[NDArray[Any]] = []
+    for tile in tiles:
+        cores = [tile.variables[name][level, HALO:-HALO, HALO:-HALO] for name in names]
+        if not whole:
+            shape = (lattice.rows + 1, lattice.columns + 1)
+            whole = [np.empty(shape, core.dtype) for core in cores]
+        i, j = tile.record.row * lattice.tile_rows, tile.record.column * lattice.tile_columns
+        for array, core in zip(whole, cores, strict=True):
+            array[i : i + core.shape[0], j : j + core.shape[1]] = core
+    return whole
+
+
+def figure_title(
+    product: str, version: str, quantity: str, height: float, height_reference: str
+) -> str:
+    """Product, version, what is drawn and at which level."""
+    label = QUANTITIES[quantity].label
+    return f"{product} {version}: {label} {height:g} m above {_SURFACES[height_reference]}"
+
+
+def figure_note(identity: Mapping[str, Any]) -> str:
+    """The small print: datum, reference field and epoch, and what the anomaly is."""
+    return (
+        f"{identity['datum']}. Reference field {identity['reference_field']} at "
+        f"{identity['reference_epoch']}. Anomaly: {identity['anomaly_definition']}."
+    )
+
+
+def _level(heights: Sequence[float], wanted: float | None) -> int:
+    if wanted is None:
+        return 0
+    nearest = int(np.argmin(np.abs(np.array(heights) - wanted)))
+    if not abs(heights[nearest] - wanted) < 0.5:
+        raise UsageError(
+            f"no level at {wanted:g} m",
+            where="--level",
+            expected=f"one of {', '.join(f'{h:g}' for h in heights)}",
+        )
+    return nearest
