@@ -1,0 +1,95 @@
+"""Opening a release."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from magtiles.catalog.releases.anomaly import Anomaly
+from magtiles.catalog.releases.folder import check_folder, read_verified
+from magtiles.catalog.releases.manifest import MANIFEST_NAME, Manifest, read_manifest
+from magtiles.catalog.releases.store import DEFAULT_CACHE_BYTES, TileStore
+from magtiles.catalog.releases.tile import TileData
+from magtiles.schemas.errors import IntegrityError, QueryError
+
+
+class Release:
+    """An open release, from `open_release`. Safe to share between threads."""
+
+    def __init__(
+        self, path: Path, manifest: Manifest, allow_extrapolated: bool, cache_bytes: int
+    ) -> None:
+        self.path = path
+        self.manifest = manifest
+        self._extrapolate = allow_extrapolated
+        self._store = TileStore(path, manifest, cache_bytes)
+
+    @cached_property
+    def anomaly(self) -> Anomaly:
+        """Queries of the anomaly."""
+        return Anomaly(self.manifest, self._store, self._extrapolate)
+
+    @property
+    def temporal(self) -> Any:
+        """The model of time variations; raises QueryError when the release has none."""
+        raise self._lacks("temporal model")
+
+    @property
+    def roads(self) -> Any:
+        """Maps of roads by name; raises QueryError when the release has none."""
+        raise self._lacks("road maps")
+
+    def tiles(self) -> Iterator[TileData]:
+        """Every tile, whole: size, sha256, contract and lattice verified. IntegrityError."""
+        return self._store.read_all()
+
+    def file(self, path: str) -> bytes:
+        """The verified bytes of one file of the release, by its path in the manifest."""
+        for record in self.manifest.files:
+            if record.path == path:
+                return read_verified(self.path / path, size=record.size, digest=record.sha256)
+        raise IntegrityError("is not part of the release", where=self.path / path)
+
+    def __repr__(self) -> str:
+        return f"<Release {self.manifest.product} {self.manifest.version} at {self.path}>"
+
+    def _lacks(self, what: str) -> QueryError:
+        return QueryError(
+            f"has no {what}", where=f"release {self.manifest.product} {self.manifest.version}"
+        )
+
+
+def open_release(
+    path: str | os.PathLike[str],
+    *,
+    allow_extrapolated: bool = False,
+    cache_bytes: int = DEFAULT_CACHE_BYTES,
+) -> Release:
+    """Open a release folder, ``<store>/<product>/<version>``.
+
+    Checks the manifest, and that the folder holds exactly the files it lists, of their sizes;
+    a tile's sha256 and contract are checked when it is first touched. Nothing is executed.
+
+    Parameters
+    ----------
+    path : the folder that holds ``manifest.json``.
+    allow_extrapolated : answer with numbers, not NaN, where the map is beyond its coverage.
+    cache_bytes : memory for tiles and their splines; least recently used tiles go first, and
+        one tile is always kept.
+
+    Raises
+    ------
+    IntegrityError : the release is not what its manifest says, or is no release.
+    """
+    folder = Path(path)
+    if not (folder / MANIFEST_NAME).is_file():
+        raise IntegrityError(
+            "is no release", where=folder, expected=f"a folder with {MANIFEST_NAME}",
+            remedy="give <store>/<product>/<version>",
+        )  # fmt: skip
+    manifest = read_manifest(folder)
+    check_folder(folder, {file.path: file.size for file in manifest.files}, {MANIFEST_NAME})
+    return Release(folder, manifest, allow_extrapolated, cache_bytes)
