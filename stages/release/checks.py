@@ -1,0 +1,136 @@
+"""checks.json: positions with expected answers, so that any reader can test itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtiles.catalog.releases.fields import parse_json
+from magtiles.catalog.releases.manifest import Manifest
+from magtiles.catalog.releases.reader import Release
+from magtiles.schemas.errors import IntegrityError
+
+CHECKS_NAME = "checks.json"
+FORMAT = "release-checks/1.0.0"
+TOLERANCE = 1e-6
+"""Relative to 1 nT, 1 nT/km or the answer, whichever is larger."""
+
+_POINTS_PER_TILE = 12
+_TILES = 8
+_UNITS = {
+    "total": "nT",
+    "total_gradient": "nT km-1",
+    "vector": "nT",
+    "vector_gradient": "nT km-1",
+    "tensor": "nT km-1",
+    "uncertainty_total": "nT",
+    "uncertainty_vector": "nT",
+    "uncertainty_tensor": "nT km-1",
+}
+
+
+def make_checks(release: Release) -> dict[str, Any]:
+    """Positions in and around several tiles, and what the reader answers there.
+
+    Positions spread over each tile's core (on and between levels) and lie on seams to
+    both sides. An expected null is NaN: no coverage.
+    """
+    latitude, longitude, height = _positions(release.manifest)
+    height_name = "height"
+    if not release.manifest.takes_ellipsoidal_height:
+        height_name = "height_above_reference"
+    elif release.manifest.has_reference_surface:
+        height = height + release.anomaly.reference_surface(latitude, longitude)
+    positions = {"latitude": latitude, "longitude": longitude, height_name: height}
+    return {
+        "format": FORMAT,
+        "tolerance": TOLERANCE,
+        "units": _UNITS,
+        "positions": {name: values.tolist() for name, values in positions.items()},
+        "expected": {name: _plain(v) for name, v in _answers(release, positions).items()},
+    }
+
+
+def replay_checks(release: Release) -> float:
+    """Ask the release its own checks; the largest error relative to the tolerance.
+
+    Raises IntegrityError naming the first answer that is off.
+    """
+    where = release.path / CHECKS_NAME
+    document = parse_json(release.file(CHECKS_NAME), where)
+    positions = _arrays(document.inner("positions").plain(), where)
+    expected = _arrays(document.inner("expected").plain(), where)
+    answers = _answers(release, positions)
+    worst = 0.0
+    for name, wanted in expected.items():
+        if name not in answers or answers[name].shape != wanted.shape:
+            raise IntegrityError(f"has no answers of the shape of {name}", where=where)
+        error = np.abs(answers[name] - wanted) / np.maximum(1.0, np.abs(wanted)) / TOLERANCE
+        error = np.where(np.isnan(answers[name]) & np.isnan(wanted), 0.0, error)
+        if not np.all(error <= 1.0):
+            first = int(np.argmax(~(error <= 1.0).reshape(len(wanted), -1).all(axis=1)))
+            raise IntegrityError(
+                f"{name}[{first}] is {answers[name][first]}",
+                where=where,
+                expected=f"{wanted[first]}",
+                remedy="the reader and the release disagree: rebuild with this version",
+            )
+        worst = max(worst, float(error.max(initial=0.0)))
+    return worst
+
+
+def _answers(release: Release, at: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    an = release.anomaly
+    total, total_gradient = an.total_with_gradient(**at)
+    vector, vector_gradient = an.vector_with_gradient(**at)
+    answers: dict[str, NDArray[Any]] = {
+        "total": total,
+        "total_gradient": total_gradient,
+        "vector": vector,
+        "vector_gradient": vector_gradient,
+        "tensor": an.tensor(**at),
+        "flags": an.flags(**at),
+    }
+    for quantity in ("total", "vector", "tensor"):
+        answers[f"uncertainty_{quantity}"] = an.uncertainty(**at, quantity=quantity)
+    return answers
+
+
+def _positions(manifest: Manifest) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Points of a low-discrepancy sequence in a few tiles, every fourth on a seam."""
+    lattice, levels = manifest.lattice, np.array(manifest.heights_m)
+    places = sorted(manifest.tiles)
+    chosen = [places[i] for i in np.unique(np.linspace(0, len(places) - 1, _TILES).astype(int))]
+    # Roberts' additive sequence in three dimensions: the plastic number's sister, 1.2207...
+    steps = np.arange(1, _POINTS_PER_TILE * len(chosen) + 1)
+    u, v, w = ((0.5 + steps * 1.2207440846057596**-k) % 1.0 for k in (1, 2, 3))
+    row, column = np.repeat(np.array(chosen), _POINTS_PER_TILE, axis=0).T
+    core = np.array([lattice.core(*place) for place in chosen]).repeat(_POINTS_PER_TILE, axis=0)
+    u[::4] = np.where(steps[::4] % 8 == 1, 0.0, 1e-9)
+    y = np.minimum(row * lattice.tile_rows + u * core[:, 0], lattice.rows)
+    x = np.minimum(column * lattice.tile_columns + v * core[:, 1], lattice.columns)
+    height = np.interp(w * (len(levels) - 1), np.arange(len(levels)), levels)
+    height[::3] = levels[steps[::3] % len(levels)]
+    longitude = (lattice.west + x * lattice.longitude_spacing + 180.0) % 360.0 - 180.0
+    return lattice.south + y * lattice.latitude_spacing, longitude, height
+
+
+def _plain(values: NDArray[Any]) -> list[Any]:
+    """Nested lists with ten significant digits, and None for NaN."""
+    flat = [
+        None if value != value else float(f"{value:.10g}") if values.dtype.kind == "f" else value
+        for value in values.ravel().tolist()
+    ]
+    nested = np.array(flat, dtype=object).reshape(values.shape)
+    plain: list[Any] = nested.tolist()
+    return plain
+
+
+def _arrays(lists: Mapping[str, Any], where: object) -> dict[str, NDArray[Any]]:
+    try:
+        return {name: np.array(values, dtype=np.float64) for name, values in lists.items()}
+    except (TypeError, ValueError) as caught:
+        raise IntegrityError(f"holds no arrays: {caught}", where=where) from None

@@ -1,0 +1,324 @@
+"""Publishing a release: built beside its place, validated, then there by one rename."""
+
+from __future__ import annotations
+
+import datetime
+import importlib.metadata
+import json
+import os
+import re
+import shutil
+import socket
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from magtiles.catalog.releases.digest import canonical_json, manifest_digest, sha256
+from magtiles.catalog.releases.manifest import (
+    CONTRACT,
+    MANIFEST_NAME,
+    NAME,
+    Manifest,
+    parse_manifest,
+    read_manifest,
+)
+from magtiles.catalog.releases.reader import open_release
+from magtiles.catalog.releases.tile_table import UNITS
+from magtiles.catalog.releases.versions import (
+    check_same,
+    check_successor,
+    format_version,
+    parse_version,
+)
+from magtiles.schemas import contracts
+from magtiles.schemas.errors import ContractError, SourceError, VersionError
+from magtiles.stages.release.atomic import sync, write_bytes
+from magtiles.stages.release.checks import CHECKS_NAME, make_checks, replay_checks
+from magtiles.stages.release.records import (
+    IDENTITY_ATTRIBUTES,
+    MeasuredTile,
+    common_lattice,
+    measure_tile,
+)
+
+LATEST_NAME = "latest.json"
+PROVENANCE_NAME = "provenance.json"
+
+_STAGING = ".staging."
+_EXTRA_ROLES = {
+    r"preview/[A-Za-z0-9_-][A-Za-z0-9._-]*": "preview",
+    r"core_field\.shc": "core_field",
+}
+_DATUM = "WGS84"
+
+
+@dataclass(frozen=True)
+class PublishResult:
+    """Where the release is, and whether this call made it."""
+
+    path: Path
+    changed: bool
+
+
+def publish_release(
+    store: Path,
+    *,
+    product: str,
+    version: str,
+    tiles: Sequence[Path],
+    identity: Mapping[str, Any],
+    inputs: Sequence[Mapping[str, Any]],
+    provenance: Mapping[str, Any],
+    extra_files: Mapping[str, Path],
+) -> PublishResult:
+    """Publish tiles as ``<store>/<product>/<version>``, read-only and never changed again.
+
+    Parameters
+    ----------
+    tiles : files of contract anomaly-tile/1 that cover a lattice whole; they are copied.
+    identity : what the release is, beyond the tiles' reference field, epoch and definition;
+        a value that contradicts the tiles raises ContractError.
+    inputs : the sources, each with the keys id, sha256, licence and role.
+    provenance : how it was made, any JSON.
+    extra_files : ``preview/*`` and ``core_field.shc``, path in the release to file.
+
+    Returns
+    -------
+    The release's folder; `changed` is False when the version exists with this very content.
+
+    Raises
+    ------
+    VersionError : the version exists with other content, or is too small a step.
+    ContractError, FormatError : tiles that are none, or do not fit together.
+    """
+    if not re.fullmatch(NAME, product):
+        raise SourceError(f"'{product}' is no product name", expected=f"letters like {NAME}")
+    parse_version(version)
+    home = store / product
+    home.mkdir(parents=True, exist_ok=True)
+    _remove_dead_staging(home)
+    measured = sorted((measure_tile(p) for p in tiles), key=lambda t: str(t.entry["path"]))
+    document = _document(product, version, measured, identity, inputs)
+    extras = {path: _extra(path, file) for path, file in sorted(extra_files.items())}
+    files = {PROVENANCE_NAME: canonical_json(provenance), **extras}
+    final = home / version
+    _add_files(document, files)
+    changed = not _exists_already(home, _sealed(document))
+    if changed:
+        _build(home, final, document, measured, files)
+    _point_to_latest(home)
+    return PublishResult(final, changed)
+
+
+def published_versions(home: Path) -> list[Manifest]:
+    """The manifests of all versions in ``<store>/<product>``, oldest version first."""
+    folders = [f for f in home.iterdir() if f.is_dir() and re.fullmatch(r"\d+\.\d+\.\d+", f.name)]
+    manifests = [read_manifest(folder) for folder in folders]
+    return sorted(manifests, key=lambda m: parse_version(m.version))
+
+
+def _exists_already(home: Path, new: Manifest) -> bool:
+    """Whether the version is there with the same content. VersionError when it may not be."""
+    existing = published_versions(home)
+    for manifest in existing:
+        if manifest.version == new.version:
+            check_same(manifest, new, parse_version(existing[-1].version))
+            return True
+    check_successor(existing, new)
+    return False
+
+
+def _document(
+    product: str,
+    version: str,
+    tiles: Sequence[MeasuredTile],
+    identity: Mapping[str, Any],
+    inputs: Sequence[Mapping[str, Any]],
+) -> dict[str, Any]:
+    """The manifest as far as tiles and arguments tell it."""
+    if not tiles:
+        raise ContractError("there are none", where="tiles", expected="at least one tile")
+    lattice = common_lattice(tiles)
+    document = {
+        "contract": CONTRACT,
+        "product": product,
+        "version": version,
+        "magtiles": importlib.metadata.version("magtiles"),
+        "identity": _identity(tiles, identity),
+        "lattice": {key: getattr(lattice, key) for key in lattice.__dataclass_fields__},
+        "heights_m": list(_shared(tiles, lambda t: t.heights, "height")),
+        "height_reference": _shared(
+            tiles, lambda t: t.attributes["height_reference"], "height_reference"
+        ),
+        "inputs": [dict(item) for item in inputs],
+        "files": [
+            {**t.entry, "bounds": lattice.bounds(t.entry["row"], t.entry["column"])} for t in tiles
+        ],
+    }
+    if "SOURCE_DATE_EPOCH" in os.environ:
+        seconds = int(os.environ["SOURCE_DATE_EPOCH"])
+        moment = datetime.datetime.fromtimestamp(seconds, tz=datetime.UTC)
+        document["created"] = moment.strftime("%Y-%m-%dT%H:%M:%SZ")
+    return document
+
+
+def _identity(tiles: Sequence[MeasuredTile], given: Mapping[str, Any]) -> dict[str, Any]:
+    known: dict[str, Any] = {"datum": _DATUM, "units": dict(UNITS)}
+    for name in IDENTITY_ATTRIBUTES:
+        known[name] = _shared(tiles, lambda t, name=name: t.attributes[name], name)
+    for name, value in given.items():
+        if name in known and known[name] != value:
+            raise ContractError(
+                f"is {value!r}",
+                where=f"identity {name}",
+                expected=f"{known[name]!r} as in the tiles",
+            )
+    return {**given, **known}
+
+
+def _shared(tiles: Sequence[MeasuredTile], get: Any, name: str) -> Any:
+    for tile in tiles:
+        if get(tile) != get(tiles[0]):
+            raise ContractError(
+                f"{name} is {get(tile)!r}",
+                where=tile.source,
+                expected=f"{get(tiles[0])!r} as in {tiles[0].source.name}",
+            )
+    return get(tiles[0])
+
+
+def _extra(path: str, file: Path) -> bytes:
+    if not any(re.fullmatch(pattern, path) for pattern in _EXTRA_ROLES):
+        raise ContractError(
+            "has no place in a release", where=path, expected="preview/<name> or core_field.shc"
+        )
+    return file.read_bytes()
+
+
+def _role(path: str) -> str:
+    for pattern, role in _EXTRA_ROLES.items():
+        if re.fullmatch(pattern, path):
+            return role
+    return {PROVENANCE_NAME: "provenance", CHECKS_NAME: "checks"}[path]
+
+
+def _add_files(document: dict[str, Any], files: Mapping[str, bytes]) -> None:
+    document["files"] += [
+        {"path": path, "size": len(data), "sha256": sha256(data), "role": _role(path)}
+        for path, data in files.items()
+    ]
+
+
+def _sealed(document: Mapping[str, Any]) -> Manifest:
+    """The manifest with its own digest, as the reader would parse it."""
+    return parse_manifest(_seal(document), "manifest of the new release")
+
+
+def _seal(document: Mapping[str, Any]) -> bytes:
+    plain = json.loads(canonical_json(document))
+    return canonical_json({**plain, "manifest_digest": manifest_digest(plain)})
+
+
+def _build(
+    home: Path,
+    final: Path,
+    document: dict[str, Any],
+    tiles: Sequence[MeasuredTile],
+    files: Mapping[str, bytes],
+) -> None:
+    """Build in a temporary sibling and rename it to `final`; on failure nothing stays."""
+    staging = home / f"{_STAGING}{socket.gethostname()}.{os.getpid()}"
+    staging.mkdir()
+    try:
+        for tile in tiles:
+            _copy(tile, staging)
+        for path, data in files.items():
+            (staging / path).parent.mkdir(exist_ok=True)
+            (staging / path).write_bytes(data)
+        _complete(staging, document)
+        _protect(staging)
+        _rename(staging, final)
+    except BaseException:
+        _remove(staging)
+        raise
+    sync(home)
+
+
+def _copy(tile: MeasuredTile, staging: Path) -> None:
+    # A hard link would let a later write to the work file change the release.
+    data = tile.source.read_bytes()
+    if sha256(data) != tile.entry["sha256"]:
+        raise ContractError("changed while it was being published", where=tile.source)
+    target = staging / str(tile.entry["path"])
+    target.parent.mkdir(exist_ok=True)
+    target.write_bytes(data)
+
+
+def _complete(staging: Path, document: dict[str, Any]) -> None:
+    """Add the checks and the final manifest, then read the release back and try it."""
+    write_bytes(staging / MANIFEST_NAME, _seal(document))
+    checks = canonical_json(make_checks(open_release(staging)))
+    (staging / CHECKS_NAME).write_bytes(checks)
+    _add_files(document, {CHECKS_NAME: checks})
+    contracts.check_document(json.loads(_seal(document)), CONTRACT, where=MANIFEST_NAME)
+    write_bytes(staging / MANIFEST_NAME, _seal(document))
+    replay_checks(open_release(staging))
+
+
+def _protect(staging: Path) -> None:
+    """Sync everything and take away the permission to write."""
+    for folder, _, names in os.walk(staging, topdown=False):
+        for name in names:
+            sync(Path(folder, name))
+            Path(folder, name).chmod(0o444)
+        sync(Path(folder))
+        Path(folder).chmod(0o555)
+
+
+def _rename(staging: Path, final: Path) -> None:
+    try:
+        staging.rename(final)
+    except OSError:
+        if not final.exists():
+            raise
+        raise VersionError(
+            "was published by another process meanwhile", where=final, remedy="build again"
+        ) from None
+
+
+def _remove_dead_staging(home: Path) -> None:
+    """Remove what a killed build left; a living process, or another machine, keeps its own."""
+    for folder in home.glob(f"{_STAGING}{socket.gethostname()}.*"):
+        pid = folder.name.rpartition(".")[2]
+        if pid.isdigit() and not _alive(int(pid)):
+            _remove(folder)
+
+
+def _alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    # One process publishes one release at a time, so what carries its own number is dead.
+    return pid != os.getpid()
+
+
+def _remove(folder: Path) -> None:
+    for inner, _, _ in os.walk(folder):
+        Path(inner).chmod(0o755)
+    shutil.rmtree(folder)
+
+
+def _point_to_latest(home: Path) -> None:
+    newest = published_versions(home)[-1]
+    latest = {
+        "product": newest.product,
+        "version": format_version(parse_version(newest.version)),
+        "manifest_digest": newest.manifest_digest,
+    }
+    path, data = home / LATEST_NAME, canonical_json(latest)
+    if not path.is_file() or path.read_bytes() != data:
+        write_bytes(path, data)
