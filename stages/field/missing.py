@@ -37,6 +37,8 @@ REALISATIONS = 16
 _LARGEST = 256
 _SEED = 20180322
 _AMPLITUDE_LIMITS = (1 / 9, 9.0)
+_ROUGH_CELLS = 4.0
+_LOCAL_CELLS = 8.0
 
 
 @dataclass(frozen=True)
@@ -135,16 +137,25 @@ class _Experiment:
         }
 
     def local_power(self) -> Real:
-        """Local power of the anomaly relative to its mean, which the random fields lack."""
+        """Local power of the anomaly's short wavelengths relative to its mean.
+
+        The random fields are alike everywhere; a real map is rough here and smooth there, and
+        what a gap hides is as rough as what surrounds it.
+        """
         weight = (~self.gaps).astype(float)
-        power = (self.values - self.values[~self.gaps].mean()) ** 2 * weight
-        width = max(self.values.shape) / 8
-        smooth = [ndimage.gaussian_filter(a, width, mode="nearest") for a in (power, weight)]
-        mean = power.sum() / weight.sum()
-        if mean == 0.0:
+        if not self.gaps.all() and np.ptp(self.values[~self.gaps]) == 0.0:
             return np.ones(self.values.shape)
-        ratio = smooth[0] / np.maximum(smooth[1], 1e-6) / mean
-        return np.asarray(np.clip(ratio, *_AMPLITUDE_LIMITS))
+        rough = self.values - self._smooth(self.values, weight, _ROUGH_CELLS)
+        ratio = self._smooth(rough**2, weight, _LOCAL_CELLS)
+        return np.asarray(np.clip(ratio / np.average(ratio, weights=weight), *_AMPLITUDE_LIMITS))
+
+    @staticmethod
+    def _smooth(values: Real, weight: Real, width: float) -> Real:
+        """Gaussian mean of the weighted nodes around each."""
+        total = ndimage.gaussian_filter(values * weight, width, mode="constant")
+        return np.asarray(
+            total / np.maximum(ndimage.gaussian_filter(weight, width, mode="constant"), 1e-12)
+        )
 
     def _mean_square(
         self, field: AnomalousField, potential: Complex, products: tuple[str, ...]
@@ -163,7 +174,8 @@ def _amplitude(values: Real, gaps: Mask, inversion: Inversion, noise: float) -> 
     map's variance; the azimuthal mean of the projection takes it from the total to the potential.
     """
     w = inversion.wavenumbers
-    weight = np.outer(*(np.hanning(n + 2)[1:-1] for n in values.shape)) * ~gaps
+    # The fill is kept: to blank it would cut edges, whose spectrum is not the map's.
+    weight = np.outer(*(np.hanning(n + 2)[1:-1] for n in values.shape))
     centred = (values - np.average(values, weights=weight)) * weight
     periodogram = np.abs(forward(centred, w.shape)) ** 2 / (weight**2).sum()
     counts = np.broadcast_to(w.multiplicity, w.k.shape).ravel()
