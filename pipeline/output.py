@@ -48,7 +48,7 @@ def print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
 
 def _is_number(cell: str) -> bool:
     try:
-        float(cell)
+        float(cell.removesuffix("%"))
     except ValueError:
         return cell == "-"
     return True

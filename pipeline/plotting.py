@@ -230,7 +230,8 @@ def hillshade(
     north, east = south_north / steep, west_east / steep
     # A slope that rises toward the south-east faces the light.
     facing = (east - north) / np.sqrt(2.0 * (1.0 + north**2 + east**2))
-    return np.nan_to_num(0.5 + 0.5 * facing, nan=0.5)
+    shade: NDArray[np.float64] = np.nan_to_num(0.5 + 0.5 * facing, nan=0.5)
+    return shade
 
 
 def _lit(colour: NDArray[np.float64], shade: NDArray[np.float64]) -> NDArray[np.float64]:

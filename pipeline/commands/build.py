@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from magtiles.pipeline.output import print_json
+
 HELP = "build and publish the release of a product"
 NEEDS_PIPELINE = True
 
@@ -12,6 +14,7 @@ NEEDS_PIPELINE = True
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``magtiles build``."""
     parser.add_argument("product", type=Path, metavar="PRODUCT.toml", help="the product")
+    parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument(
         "--store", type=Path, required=True, metavar="DIR", help="the folder of all releases"
     )
@@ -44,5 +47,11 @@ def run(arguments: argparse.Namespace) -> int:
             data=arguments.data,
             progress=progress,
         )
-    print(result)
+    if arguments.json:
+        print_json(result)
+        return 0
+    print(f"{result.path}: {'published' if result.changed else 'is already published, unchanged'}")
+    print("next:")
+    for command in (f"info {result.path}", f"plot {result.path} --out map.png"):
+        print(f"  magtiles {command}")
     return 0

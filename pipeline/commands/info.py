@@ -36,7 +36,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print_json(described)
     else:
-        _print_described(described, arguments.release)
+        _print_described(described)
+        _print_next(manifest, arguments.release)
     return 0
 
 
@@ -57,7 +58,6 @@ def describe(manifest: Manifest) -> dict[str, Any]:
         "tiles": len(manifest.tiles),
         "heights_m": list(manifest.heights_m),
         "height_reference": manifest.height_reference,
-        "takes_ellipsoidal_height": manifest.takes_ellipsoidal_height,
         "uncertainty": {name: _range_by_level(manifest, name) for name in _UNCERTAINTIES},
         "flag_fractions": _flag_fractions(manifest),
         "sizes": _sizes(manifest),
@@ -98,7 +98,7 @@ def _sizes(manifest: Manifest) -> dict[str, int]:
     return {**dict(sorted(sizes.items())), "total": sum(sizes.values())}
 
 
-def _print_described(about: dict[str, Any], folder: Path) -> None:
+def _print_described(about: dict[str, Any]) -> None:
     south, north = about["coverage"]["latitude"]
     west, east = about["coverage"]["longitude"]
     rows, columns = about["nodes"]
@@ -125,7 +125,6 @@ def _print_described(about: dict[str, Any], folder: Path) -> None:
     print()
     inputs = [(i["id"], i["role"], i["licence"]) for i in about["inputs"]]
     print_table(("input", "role", "licence"), inputs)
-    _print_next(about, folder)
 
 
 def _print_levels(about: dict[str, Any]) -> None:
@@ -140,19 +139,17 @@ def _print_levels(about: dict[str, Any]) -> None:
     print_table(("level m", *titles), rows)
 
 
-def _print_next(about: dict[str, Any], folder: Path) -> None:
-    south, north = about["coverage"]["latitude"]
-    west, east = about["coverage"]["longitude"]
-    middle = (south + north) / 2.0, _wrapped(west + ((east - west) % 360.0) / 2.0)
-    height = about["heights_m"][-1]
+def _print_next(manifest: Manifest, folder: Path) -> None:
+    best = min(
+        manifest.tiles.values(), key=lambda tile: tile.flag_fractions.get("beyond_coverage", 0.0)
+    )
+    latitude = sum(best.bounds["latitude"]) / 2.0
+    longitude = _wrapped(sum(best.bounds["longitude"]) / 2.0)
+    option = "" if manifest.takes_ellipsoidal_height else " --height-above-reference"
     print("\nnext:")
     print(f"  magtiles validate {folder}")
     print(f"  magtiles plot {folder} --out map.png")
     print(
-        f"  magtiles query {folder} --lat {middle[0]:.5g} --lon {middle[1]:.6g}"
-        f" --height {height:g}" + _height_option(about)
+        f"  magtiles query {folder} --lat {latitude:.5f} --lon {longitude:.5f}"
+        f" --height {manifest.heights_m[-1]:g}{option}"
     )
-
-
-def _height_option(about: dict[str, Any]) -> str:
-    return "" if about["takes_ellipsoidal_height"] else " --height-above-reference"

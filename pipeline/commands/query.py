@@ -77,7 +77,15 @@ def answer(
     latitude, longitude, height = positions.T
     place: dict[str, Any] = {"latitude": latitude, "longitude": longitude}
     place["height_above_reference" if above_reference else "height"] = height
-    anomaly = open_release(folder).anomaly
+    release = open_release(folder)
+    if not (above_reference or release.manifest.takes_ellipsoidal_height):
+        surface = release.manifest.height_reference.replace("_", " ")
+        raise UsageError(
+            f"heights of this release count from {surface}, whose own height it does not know",
+            where="--height",
+            remedy="give heights above it, and --height-above-reference",
+        )
+    anomaly = release.anomaly
     total = anomaly.total(**place)
     vector = anomaly.vector(**place)
     uncertainty = anomaly.uncertainty(**place)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -88,13 +87,13 @@ def tile_arrays(row: int, column: int) -> Arrays:
     return arrays | {"crs": np.array(0, np.int32)}
 
 
-def write_tile(path: Path, row: int, column: int, arrays: Arrays) -> None:
+def write_tile(path: Path, row: int, column: int, arrays: Arrays, height_reference: str) -> None:
     core = LATTICE.core(row, column)
     attributes = {
         **{k: v for k, v in IDENTITY.items() if isinstance(v, str) and k != "datum"},
         "Conventions": "CF-1.11",
         "contract": "anomaly-tile/1.0.0",
-        "height_reference": "ellipsoid",
+        "height_reference": height_reference,
         "source": "exact dipoles",
         "ambient_inclination_deg": 70.0,
         "ambient_declination_deg": 15.0,
@@ -154,7 +153,7 @@ def tile_record(folder: Path, row: int, column: int, arrays: Arrays) -> dict[str
     }
 
 
-def write_manifest(folder: Path, files: list[dict[str, Any]]) -> None:
+def write_manifest(folder: Path, files: list[dict[str, Any]], height_reference: str) -> None:
     document: dict[str, Any] = {
         "contract": "release-manifest/1.0.0",
         "product": "exact",
@@ -163,7 +162,7 @@ def write_manifest(folder: Path, files: list[dict[str, Any]]) -> None:
         "identity": IDENTITY,
         "lattice": LATTICE.__dict__,
         "heights_m": list(HEIGHTS),
-        "height_reference": "ellipsoid",
+        "height_reference": height_reference,
         "files": files,
         "inputs": [{"id": "dipoles", "sha256": "0" * 64, "licence": "CC0-1.0", "role": "anomaly"}],
     }
@@ -174,20 +173,26 @@ def write_manifest(folder: Path, files: list[dict[str, Any]]) -> None:
 Change = Callable[[int, int, Arrays], None]
 
 
-def build_release(folder: Path, change: Change = lambda row, column, arrays: None) -> Path:
+def build_release(
+    folder: Path,
+    change: Change = lambda row, column, arrays: None,
+    height_reference: str = "ellipsoid",
+) -> Path:
     """Write the release; `change` may alter a tile's arrays first, digests follow."""
     files = []
     for row in range(LATTICE.shape[0]):
         for column in range(LATTICE.shape[1]):
             arrays = tile_arrays(row, column)
             change(row, column, arrays)
-            write_tile(folder / f"tiles/{row}-{column}.nc", row, column, arrays)
+            write_tile(folder / f"tiles/{row}-{column}.nc", row, column, arrays, height_reference)
             files.append(tile_record(folder, row, column, arrays))
-    write_manifest(folder, files)
+    write_manifest(folder, files, height_reference)
     checks = canonical_json(make_checks(open_release(folder)))
     (folder / CHECKS_NAME).write_bytes(checks)
     record = {"path": CHECKS_NAME, "size": len(checks), "sha256": sha256(checks)}
-    write_manifest(folder, [*files, record | {"role": "checks", "contract": None}])
+    write_manifest(
+        folder, [*files, record | {"role": "checks", "contract": None}], height_reference
+    )
     return folder
 
 
@@ -203,11 +208,13 @@ def spoilt_release(tmp_path: Path) -> Callable[[Change], Path]:
     return lambda change: build_release(tmp_path / "spoilt", change)
 
 
+@pytest.fixture(scope="session")
+def terrain_release(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The release as if its heights counted from a terrain of unknown height."""
+    return build_release(tmp_path_factory.mktemp("terrain") / "1.2.3", height_reference="terrain")
+
+
 @pytest.fixture
 def release_copy(exact_release: Path, tmp_path: Path) -> Path:
     """The release, to be damaged."""
     return Path(shutil.copytree(exact_release, tmp_path / "copy"))
-
-
-def read_json(path: Path) -> Any:
-    return json.loads(path.read_text())
