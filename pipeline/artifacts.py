@@ -13,7 +13,8 @@ import numpy as np
 import xarray as xr
 
 from magtiles.schemas import contracts
-from magtiles.schemas.errors import FormatError, MagtilesError
+from magtiles.schemas.errors import ContractError, FormatError, MagtilesError
+from magtiles.stages.release.tile_file import write_tile
 
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _DEFLATE_LIMIT = 1032
@@ -50,8 +51,13 @@ def _sync(path: Path) -> None:
 def write_artifact(dataset: xr.Dataset, path: Path, contract: str) -> None:
     """Write a dataset, uncompressed, with its contract's full name in attribute `contract`.
 
-    The caller has checked the dataset. Raises MagtilesError when it cannot be written.
+    Tiles are packed as a release holds them. The caller has checked the dataset. Raises
+    MagtilesError when it cannot be written.
     """
+    if contract.startswith("anomaly-tile/"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_tile(dataset, path)
+        return
     plain = dataset.drop_encoding()
     plain.attrs |= {"Conventions": "CF-1.11", "contract": contracts.resolve(contract)}
     encoding: dict[Any, Any] = {}
@@ -67,15 +73,16 @@ def write_artifact(dataset: xr.Dataset, path: Path, contract: str) -> None:
             ) from caught
 
 
-def open_artifact(path: Path) -> xr.Dataset:
+def open_artifact(path: Path, *, cache: bool = True) -> xr.Dataset:
     """Open an artifact, its arrays loaded when first touched and kept in their stored dtype.
 
-    Raises FormatError for a file that is missing, truncated, damaged or of another format.
+    Without `cache` every touch reads again and keeps nothing in memory. Raises FormatError
+    for a file that is missing, truncated, damaged or of another format.
     """
     _check_signature(path)
     try:
         dataset = xr.open_dataset(
-            path, engine="netcdf4", mask_and_scale=False, decode_timedelta=False
+            path, engine="netcdf4", mask_and_scale=False, decode_timedelta=False, cache=cache
         )
     except (OSError, RuntimeError, ValueError, AttributeError) as caught:
         raise _damaged(path, caught) from caught
@@ -91,17 +98,20 @@ def open_artifact(path: Path) -> xr.Dataset:
     return dataset
 
 
-def load_checked(dataset: xr.Dataset, contract: str, *, path: Path, role: str) -> None:
-    """Check an opened artifact against a contract; this reads all of its arrays.
+def check_artifact(path: Path, contract: str, *, role: str) -> None:
+    """Check an artifact against a contract, reading every array once and keeping none.
 
     Raises ContractError naming file and role, FormatError when the arrays cannot be read.
     """
     where = f"{path} (role {role})"
-    try:
-        dataset.load()
-    except (OSError, RuntimeError) as caught:
-        raise _damaged(path, caught) from caught
-    contracts.check(dataset, contract, where=where)
+    with open_artifact(path, cache=False) as dataset:
+        claimed = str(dataset.attrs.get("contract", contract))
+        if claimed.partition("/")[0] != contract.partition("/")[0]:
+            raise ContractError(f"the file holds a {claimed}", where=where, expected=contract)
+        try:
+            contracts.check(dataset, contract, where=where)
+        except (OSError, RuntimeError) as caught:
+            raise _damaged(path, caught) from caught
 
 
 def _check_signature(path: Path) -> None:

@@ -7,12 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
 from magtiles.catalog import open_release
-from magtiles.catalog.releases.lattice import HALO, Lattice
+from magtiles.catalog.kernels.bspline import HALO
+from magtiles.catalog.releases.lattice import Lattice
 from magtiles.catalog.releases.tile import TileData
-from magtiles.pipeline.plotting import QUANTITIES, preview_figure
+from magtiles.pipeline.plotting import QUANTITIES, preview_figure, save_png
 from magtiles.schemas.errors import UsageError
 
 if TYPE_CHECKING:
@@ -52,6 +54,23 @@ def release_figure(folder: Path, *, height: float | None, quantity: str) -> Figu
         ),
         note=figure_note(manifest.identity),
     )
+
+
+def write_preview(level: xr.Dataset, path: Path, product: str, version: str) -> None:
+    """Draw the total-field anomaly of a component grid (without its halo) to a PNG."""
+    inner = level.isel(latitude=slice(HALO, -HALO), longitude=slice(HALO, -HALO))
+    height, reference = float(level["height"]), str(level.attrs["height_reference"])
+    figure = preview_figure(
+        inner["latitude"].values,
+        inner["longitude"].values,
+        inner["magnetic_anomaly"].values,
+        inner["magnetic_anomaly_uncertainty"].values,
+        inner["quality_flag"].values,
+        quantity="total",
+        title=figure_title(product, version, "total", height, reference),
+        note=figure_note({"datum": "WGS84", **level.attrs}),
+    )
+    save_png(figure, path)
 
 
 def assemble_level(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import datetime
+import re
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -42,13 +44,28 @@ def from_angles(inclination_deg: float, declination_deg: float, shape: tuple[int
     return Ambient(*(np.full(shape, part) for part in parts))
 
 
+def reference_coefficients(reference_field: str) -> Path | None:
+    """The coefficient file of an IGRF generation that ppigrf carries; None for any other field."""
+    generation = reference_field.upper().replace("-", "").replace(" ", "")
+    file = Path(ppigrf.__file__).with_name(f"{generation}.shc")
+    return file if re.fullmatch(r"IGRF\d+", generation) and file.is_file() else None
+
+
 def igrf_direction(
-    latitude: Real, longitude: Real, height_m: float, date: datetime.datetime
+    latitude: Real,
+    longitude: Real,
+    height_m: float,
+    date: datetime.datetime,
+    coefficients: Path | None = None,
 ) -> Ambient:
-    """Direction of the IGRF at WGS84 positions (degrees) and ellipsoidal height, any shape."""
+    """Direction of the IGRF at WGS84 positions (degrees) and ellipsoidal height, any shape.
+
+    `coefficients` names an .shc file; default the newest generation.
+    """
+    file = {} if coefficients is None else {"coeff_fn": str(coefficients)}
     east, north, up = (
         np.asarray(part)[0]
-        for part in ppigrf.igrf(longitude, latitude, height_m / _METRES_PER_KM, date)
+        for part in ppigrf.igrf(longitude, latitude, height_m / _METRES_PER_KM, date, **file)
     )
     strength = np.sqrt(east**2 + north**2 + up**2)
     return Ambient(north / strength, east / strength, -up / strength)
@@ -57,8 +74,9 @@ def igrf_direction(
 class AmbientSource:
     """Where the ambient direction of a map comes from: given angles, or the IGRF at its epoch.
 
-    Whatever its generation, a reference field's direction agrees within some hundredths of a
-    degree, so the newest IGRF (definitive for past epochs) stands for all of them.
+    The IGRF is of the generation that `reference_field` names, if it is at hand. The directions
+    of all core-field models agree within hundredths of a degree, so for others the newest
+    stands in.
     Raises ParameterError if only one of the two angles is given.
     """
 
@@ -72,6 +90,7 @@ class AmbientSource:
             )
         self._angles = inclination_deg, declination_deg
         self._date = datetime.datetime.fromisoformat(grid.attrs["reference_epoch"])
+        self._coefficients = reference_coefficients(str(grid.attrs["reference_field"]))
         self._height = float(np.mean(grid["height"].values))
 
     def at(self, latitude: Real, longitude: Real) -> Ambient:
@@ -79,4 +98,4 @@ class AmbientSource:
         inclination, declination = self._angles
         if inclination is not None and declination is not None:
             return from_angles(inclination, declination, np.shape(latitude))
-        return igrf_direction(latitude, longitude, self._height, self._date)
+        return igrf_direction(latitude, longitude, self._height, self._date, self._coefficients)

@@ -1,0 +1,140 @@
+"""A product TOML: what is built from which source, and at which heights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Literal
+
+import pydantic
+
+from magtiles.schemas.errors import SourceError
+from magtiles.stages.declare import Params, parse_params, quantity
+from magtiles.stages.ingest.source import Source, load_source, load_toml
+
+
+class ProductTable(Params):
+    """[product]: the name and version of the release."""
+
+    name: str = quantity("1", pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$", doc="Name of the product.")
+    version: str = quantity(
+        "1", pattern=r"^(0|[1-9]\d*)\.(0|[1-9]\d*)\.(0|[1-9]\d*)$", doc="Version, as 1.0.0."
+    )
+
+
+class RegionTable(Params):
+    """region: limits of the release, WGS84 degrees."""
+
+    latitude: tuple[float, float] = quantity("degrees_north", doc="South and north limits.")
+    longitude: tuple[float, float] = quantity(
+        "degrees_east", doc="West and east limits; west > east crosses the date line."
+    )
+
+
+def _distinct(heights: tuple[float, ...]) -> tuple[float, ...]:
+    if not heights:
+        raise ValueError("at least one height")
+    if len(set(heights)) < len(heights):
+        raise ValueError("each height once")
+    return heights
+
+
+class AnomalyTable(Params):
+    """[anomaly]: the map, its levels and its lattice."""
+
+    source: str = quantity("1", doc="Path of a source TOML, or the id of one in the catalog.")
+    heights_m: Annotated[tuple[float, ...], pydantic.AfterValidator(_distinct)] = quantity(
+        "m", doc="Heights of the levels; the survey's own surface is added."
+    )
+    height_reference: Literal["ellipsoid", "mean_sea_level", "terrain"] = quantity(
+        "1", doc="What heights count from: the source's."
+    )
+    region: RegionTable | None = quantity("1", default=None, doc="Limits; default all data.")
+    spacing_m: float | None = quantity(
+        "m",
+        default=None,
+        gt=0,
+        doc="Node spacing; default the smaller of the source's cell and half the lowest gain.",
+    )
+    tile_deg: float | None = quantity(
+        "degree", default=None, gt=0, le=90, doc="Size of a tile; default some 200-500 cells."
+    )
+    inclination_deg: float | None = quantity(
+        "degree",
+        default=None,
+        ge=-90,
+        le=90,
+        doc="Ambient inclination; default the reference field's at its epoch.",
+    )
+    declination_deg: float | None = quantity(
+        "degree", default=None, ge=-180, le=180, doc="Ambient declination, with inclination_deg."
+    )
+    allow_downward_continuation: bool = quantity(
+        "1", default=False, doc="Permit levels below the survey (flagged)."
+    )
+
+
+class ProductTables(Params):
+    """The whole of a product TOML."""
+
+    product: ProductTable = quantity("1", doc="Name and version.")
+    anomaly: AnomalyTable = quantity("1", doc="The anomaly map.")
+
+
+@dataclass(frozen=True)
+class Product:
+    """A product with its source found and read."""
+
+    path: Path
+    product: ProductTable
+    anomaly: AnomalyTable
+    source_path: Path
+    source: Source
+
+
+def load_product(path: Path) -> Product:
+    """Read a product TOML and the source it names.
+
+    Raises SourceError naming file and key.
+    """
+    tables: ProductTables = parse_params(
+        ProductTables, load_toml(path), where=path, error=SourceError
+    )
+    source_path = _find_source(tables.anomaly.source, path)
+    source = load_source(source_path)
+    _check_reference(tables.anomaly, source, path)
+    return Product(path, tables.product, tables.anomaly, source_path, source)
+
+
+def _find_source(name: str, product: Path) -> Path:
+    if name.endswith(".toml"):
+        found = product.parent / name
+        if found.is_file():
+            return found
+        raise SourceError(
+            f"source '{name}' does not exist",
+            where=f"{product} anomaly.source",
+            expected=f"a file at {found}",
+            remedy="correct the path",
+        )
+    entry = Path(str(resources.files("magtiles.catalog"))) / "sources" / f"{name}.toml"
+    if entry.is_file():
+        return entry
+    raise SourceError(
+        f"the catalog has no source '{name}'",
+        where=f"{product} anomaly.source",
+        expected="the path of a source TOML, or an id in the catalog",
+        remedy="write the path with its .toml",
+    )
+
+
+def _check_reference(anomaly: AnomalyTable, source: Source, path: Path) -> None:
+    stated = source.grid.height_reference
+    if stated is not None and stated != anomaly.height_reference:
+        raise SourceError(
+            f"height_reference is '{anomaly.height_reference}'",
+            where=f"{path} anomaly",
+            expected=f"'{stated}', which the source states",
+            remedy="give heights above the source's own reference",
+        )
