@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magtiles.catalog.releases.lattice import HALO
+from magtiles.catalog.kernels.bspline import HALO
 
 Arrays = Mapping[str, NDArray[Any]]
 

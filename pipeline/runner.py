@@ -12,9 +12,9 @@ from typing import Any
 import xarray as xr
 
 from magtiles.pipeline import receipts
-from magtiles.pipeline.artifacts import load_checked, open_artifact, write_artifact
+from magtiles.pipeline.artifacts import check_artifact, open_artifact, write_artifact
 from magtiles.schemas import contracts
-from magtiles.schemas.errors import ContractError, FormatError, UsageError
+from magtiles.schemas.errors import FormatError, UsageError
 from magtiles.stages.declare import FILES, Many, Params, Stage, parse_params
 from magtiles.stages.ingest.source import load_source
 
@@ -87,21 +87,15 @@ def _argument(
     contract = kind.contract if isinstance(kind, Many) else kind
     datasets = []
     for path in files:
-        dataset = opened.enter_context(open_artifact(path))
-        _check_input(dataset, contracts.resolve(contract), path, role)
-        datasets.append(dataset)
+        _check_input(path, contracts.resolve(contract), role)
+        datasets.append(opened.enter_context(open_artifact(path)))
     return datasets if isinstance(kind, Many) else datasets[0]
 
 
-def _check_input(dataset: xr.Dataset, wanted: str, path: Path, role: str) -> None:
-    claimed = str(dataset.attrs.get("contract", wanted))
-    if claimed.partition("/")[0] != wanted.partition("/")[0]:
-        raise ContractError(
-            f"the file holds a {claimed}", where=f"{path} (role {role})", expected=wanted
-        )
-    key = (receipts.digest(path), wanted)
+def _check_input(path: Path, contract: str, role: str) -> None:
+    key = (receipts.digest(path), contract)
     if key not in _checked:
-        load_checked(dataset, wanted, path=path, role=role)
+        check_artifact(path, contract, role=role)
         _checked.add(key)
 
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from magtiles.catalog import open_release
 from magtiles.catalog.flags import QualityFlag
+from magtiles.catalog.kernels.bspline import HALO
 from magtiles.catalog.releases.digest import array_digest
 from magtiles.catalog.releases.folder import check_folder, read_verified
-from magtiles.catalog.releases.lattice import HALO
 from magtiles.catalog.releases.manifest import MANIFEST_NAME, Manifest, TileRecord, read_manifest
 from magtiles.catalog.releases.store import read_tile
 from magtiles.catalog.releases.tile import TileData

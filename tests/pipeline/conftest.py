@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from magtiles.catalog import open_release
 from magtiles.catalog.flags import QualityFlag, flag_attributes
+from magtiles.catalog.kernels.bspline import HALO
 from magtiles.catalog.kernels.dipole import dipole_field_geodetic, geodetic_to_ecef
 from magtiles.catalog.releases.digest import array_digest, canonical_json, manifest_digest, sha256
-from magtiles.catalog.releases.lattice import HALO, Lattice
+from magtiles.catalog.releases.lattice import Lattice
 from magtiles.catalog.releases.tile_table import TILE_VARIABLES, UNITS
 from magtiles.stages.release.checks import CHECKS_NAME, make_checks
 
