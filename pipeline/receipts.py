@@ -45,10 +45,11 @@ def identity(stage: Stage, params: Params, inputs: Mapping[str, Sequence[Path]])
     }
 
 
-def write_receipt(artifact: Path, made_from: Mapping[str, Any]) -> str:
-    """Write the receipt of a finished artifact; returns the sha256 of the artifact."""
+def write_receipt(artifact: Path, made_from: Mapping[str, Any], contract: str) -> None:
+    """Write the receipt of a finished artifact that has been checked against `contract`."""
     stat = artifact.stat()
     output = {
+        "contract": contract,
         "sha256": _sha256(artifact),
         "size": stat.st_size,
         "mtime_ns": stat.st_mtime_ns,
@@ -56,7 +57,6 @@ def write_receipt(artifact: Path, made_from: Mapping[str, Any]) -> str:
     with atomic_path(receipt_path(artifact)) as temporary:
         text = json.dumps({**made_from, "output": output}, indent=1, sort_keys=True)
         temporary.write_text(text + "\n", encoding="utf-8")
-    return str(output["sha256"])
 
 
 def why_stale(artifact: Path, made_from: Mapping[str, Any]) -> str | None:
@@ -90,11 +90,26 @@ def read_receipt(artifact: Path) -> dict[str, Any] | None:
 def digest(path: Path) -> str:
     """The sha256 of a file, from its receipt when size and time of change still match."""
     stat = path.stat()
-    if (receipt := read_receipt(path)) is not None:
-        output = receipt["output"]
-        if (output["size"], output["mtime_ns"]) == (stat.st_size, stat.st_mtime_ns):
-            return str(output["sha256"])
+    receipt = read_receipt(path)
+    if receipt is not None and _is_untouched(path, receipt):
+        return str(receipt["output"]["sha256"])
     return _sha256_once(path.resolve(), stat.st_size, stat.st_mtime_ns)
+
+
+def was_checked(path: Path, contract: str) -> bool:
+    """Whether this very code checked the artifact against `contract` when it was written."""
+    receipt = read_receipt(path)
+    return (
+        receipt is not None
+        and _is_untouched(path, receipt)
+        and receipt["output"].get("contract") == contract
+        and receipt.get("code") == code_digest()
+    )
+
+
+def _is_untouched(path: Path, receipt: Mapping[str, Any]) -> bool:
+    stat, output = path.stat(), receipt["output"]
+    return bool((output["size"], output["mtime_ns"]) == (stat.st_size, stat.st_mtime_ns))
 
 
 @functools.lru_cache(maxsize=1024)

@@ -9,14 +9,16 @@ from typing import Any
 import matplotlib.image
 import numpy as np
 import pytest
+import xarray as xr
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from magtiles.catalog import open_release
 from magtiles.catalog.flags import QualityFlag
+from magtiles.catalog.kernels.bspline import HALO
 from magtiles.pipeline.main import main
 from magtiles.pipeline.plotting import QUANTITIES, hillshade, preview_figure, save_png
-from magtiles.pipeline.preview import assemble_level, release_figure
+from magtiles.pipeline.preview import assemble_level, release_figure, write_preview
 
 LATITUDE = 60.0 + 0.01 * np.arange(50)
 LONGITUDE = 179.5 + 0.02 * np.arange(60)
@@ -131,6 +133,29 @@ def test_level_is_assembled_from_tiles_without_a_seam(exact_release: Path) -> No
     assert arrays[0].shape == (37, 29)
     # A spline passes through its nodes: 3e-11 nT measured, of 193 nT.
     assert np.abs(arrays[0] - total)[covered].max() < 1e-9
+
+
+def test_preview_of_a_level_is_the_picture_of_the_release(
+    exact_release: Path, tmp_path: Path
+) -> None:
+    """The same bytes, whether drawn from the level before cutting or from the tiles after."""
+    release = open_release(exact_release)
+    lattice, tile = release.manifest.lattice, next(iter(release.tiles()))
+    names = ("magnetic_anomaly", "magnetic_anomaly_uncertainty", "quality_flag")
+    whole = assemble_level(release.tiles(), lattice, 0, names)
+    dims = ("latitude", "longitude")
+    level = xr.Dataset(
+        {n: (dims, np.pad(array, HALO)) for n, array in zip(names, whole, strict=True)},
+        coords={
+            "latitude": lattice.latitudes(np.arange(-HALO, lattice.rows + HALO + 1)),
+            "longitude": lattice.longitudes(np.arange(-HALO, lattice.columns + HALO + 1)),
+            "height": 500.0,
+        },
+        attrs=tile.attributes,
+    )
+    write_preview(level, tmp_path / "preview.png", "exact", "1.2.3")
+    save_png(release_figure(exact_release, height=500.0, quantity="total"), tmp_path / "plot.png")
+    assert (tmp_path / "preview.png").read_bytes() == (tmp_path / "plot.png").read_bytes()
 
 
 def test_command_draws_any_level_and_quantity(

@@ -248,7 +248,11 @@ def test_input_is_checked_once_per_content(
     for factor in (2.0, 3.0):
         run_stage(SCALE, {"grid": source}, tmp_path / "out.nc", {"factor": factor})
     run_stage(SCALE, {"grid": tmp_path / "out.nc"}, tmp_path / "next.nc", {"factor": 2.0})
+    # What a stage has just made was checked before it was written.
     assert checks == [f"{source} (role grid)"] + ["output of stage scale"] * 3
+    monkeypatch.setattr(receipts, "code_digest", lambda: "newer")  # may know a newer contract
+    run_stage(SCALE, {"grid": tmp_path / "out.nc"}, tmp_path / "next.nc", {"factor": 2.0})
+    assert checks[4:] == [f"{tmp_path / 'out.nc'} (role grid)", "output of stage scale"]
 
 
 def write(path: Path, data: bytes) -> Path:
