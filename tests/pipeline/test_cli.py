@@ -13,15 +13,18 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from magtiles.pipeline import build
 from magtiles.pipeline import main as command_line
 from magtiles.pipeline.commands import run as run_command
 from magtiles.pipeline.commands import stages as stages_command
 from magtiles.pipeline.main import main
 from magtiles.pipeline.output import plain
+from magtiles.pipeline.progress import progress_bar
 from magtiles.schemas import contracts
 from magtiles.schemas.errors import IntegrityError, UsageError
 from magtiles.stages import registry
 from magtiles.stages.declare import FILES, Many, Params, Stage, quantity
+from magtiles.stages.release.publish import PublishResult
 
 
 class OffsetParams(Params):
@@ -162,6 +165,65 @@ def test_starting_imports_nothing_of_the_extra() -> None:
         [sys.executable, "-c", script], capture_output=True, text=True, check=True
     )
     assert done.stdout.splitlines()[1] == "[]"
+
+
+def test_reader_alone_can_say_what_a_release_is_and_answer(exact_release: Path) -> None:
+    script = (
+        "import sys, magtiles.pipeline.main as m\n"
+        "for name in m._EXTRA: sys.modules[name] = None\n"
+        f"release = {str(exact_release)!r}\n"
+        "print(m.main(['info', release]))\n"
+        "print(m.main(['query', release, '--lat=44.5', '--lon=-104.4', '--height=600']))\n"
+        "print(m.main(['validate', release]))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    statuses = [line for line in done.stdout.splitlines() if line in ("0", "1", "2")]
+    assert statuses == ["0", "0", "2"]
+    assert done.stderr.strip() == 'this command needs: pip install "magtiles[pipeline]"'
+
+
+def test_build_passes_its_folders_on_and_says_what_it_did(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked: list[tuple[Path, dict[str, object]]] = []
+
+    def build_product(product: Path, **folders: object) -> PublishResult:
+        asked.append((product, folders))
+        return PublishResult(Path("store/p/1.0.0"), changed=len(asked) == 1)
+
+    monkeypatch.setattr(build, "build_product", build_product)
+    argv = ["build", "p.toml", "--store", "store", "--from", "data"]
+    assert main(argv) == 0
+    assert "store/p/1.0.0: published" in capsys.readouterr().out
+    assert main(argv) == 0
+    assert "unchanged" in capsys.readouterr().out
+    assert main([*argv, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"path": "store/p/1.0.0", "changed": False}
+    product, folders = asked[0]
+    assert product == Path("p.toml")
+    folders.pop("progress")
+    assert folders == {
+        "store": Path("store"),
+        "work": Path("build/work"),
+        "data": Path("data"),
+    }
+
+
+def test_progress_is_for_terminals_only(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def advance(quiet: bool) -> str:
+        with progress_bar(quiet=quiet) as progress:
+            progress("cutting tiles", 1, 2)
+        return capsys.readouterr().err
+
+    assert advance(quiet=False) == ""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    monkeypatch.setenv("TERM", "xterm")
+    assert "cutting tiles" in advance(quiet=False)
+    assert advance(quiet=True) == ""
 
 
 @pytest.mark.usefixtures("with_offset")
