@@ -98,9 +98,9 @@ def _check_digests(folder: Path, manifest: Manifest) -> Check:
 def _check_units(manifest: Manifest) -> Check:
     stated = dict(manifest.identity["units"])
     wrong = [
-        f"{name} in {stated[name]!r}; expected {UNITS.get(name)!r}"
-        for name in sorted(stated)
-        if stated[name] != UNITS.get(name)
+        f"{name} in {stated.get(name)!r}; expected {UNITS.get(name)!r}"
+        for name in sorted(stated.keys() | UNITS.keys())
+        if stated.get(name) != UNITS.get(name)
     ]
     return _counted("units", wrong, "variables", f"{len(stated)} variables")
 

@@ -151,7 +151,13 @@ def read_positions(file: Iterable[str], name: str) -> NDArray[np.float64]:
 
     Raises FormatError naming file, line and column.
     """
-    rows = csv.DictReader(file, skipinitialspace=True)
+    try:
+        return _read_rows(csv.DictReader(file, skipinitialspace=True), name)
+    except (UnicodeDecodeError, csv.Error) as caught:
+        raise FormatError(f"is no CSV text: {caught}", where=name) from None
+
+
+def _read_rows(rows: csv.DictReader[str], name: str) -> NDArray[np.float64]:
     missing = [c for c in _COLUMNS if c not in (rows.fieldnames or ())]
     if missing:
         raise FormatError(

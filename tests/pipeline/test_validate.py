@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from magtiles.catalog.flags import QualityFlag
 from magtiles.catalog.kernels.dipole import dipole_field_geodetic
+from magtiles.catalog.releases.digest import canonical_json, manifest_digest
 from magtiles.pipeline.commands.query import read_positions
 from magtiles.pipeline.main import main
 from magtiles.pipeline.overlaps import Overlaps
@@ -91,6 +92,15 @@ def test_damage_is_found_and_placed(
     checks = {c["name"]: c for c in json.loads(capsys.readouterr().out)["checks"]}
     assert checks[check]["passed"] is False
     assert place in checks[check]["where"]
+
+
+def test_stated_units_must_be_those_of_the_contract(release_copy: Path) -> None:
+    path = release_copy / "manifest.json"
+    document = json.loads(path.read_text())
+    document["identity"]["units"]["gradient_nn"] = "nT m-1"
+    document["manifest_digest"] = manifest_digest(document)
+    path.write_bytes(canonical_json(document))
+    assert failed(release_copy)["units"].startswith("gradient_nn in 'nT m-1'; expected 'nT km-1'")
 
 
 def one_bit_in_the_halo(row: int, column: int, arrays: Arrays) -> None:
@@ -286,6 +296,12 @@ def test_positions_that_are_none(lines: list[str], expected: str) -> None:
     with pytest.raises(FormatError) as caught:
         read_positions(lines, "p.csv")
     assert expected in str(caught.value)
+
+
+def test_positions_that_are_no_text(tmp_path: Path, exact_release: Path, capsys: Capture) -> None:
+    (tmp_path / "p.csv").write_bytes(b"latitude,longitude,height\n\xff\xfe1,2,3\n")
+    assert main(["query", str(exact_release), "--positions", str(tmp_path / "p.csv")]) == 1
+    assert "p.csv: is no CSV text" in capsys.readouterr().err
 
 
 def test_info_counts_nodes_over_all_tiles(exact_release: Path, capsys: Capture) -> None:
