@@ -64,10 +64,38 @@ def spline(coefficients: Floats, y: Floats, x: Floats, out: Floats) -> None:
 
 
 @_compile
+def _dot(w: Any, a: float, b: float, c: float, d: float) -> float:
+    return float(w[0] * a + w[1] * b + w[2] * c + w[3] * d)
+
+
+@_compile
+def _along(nodes: Floats, i: int, j: int, channel: int, w: Any) -> float:
+    """Four neighbours in a row, weighted."""
+    return _dot(
+        w,
+        nodes[i, j, channel],
+        nodes[i, j + 1, channel],
+        nodes[i, j + 2, channel],
+        nodes[i, j + 3, channel],
+    )
+
+
+@_compile
+def _is_hidden(hidden: NDArray[np.bool_], y: float, x: float) -> bool:
+    """Whether a node that contributes at a position is hidden."""
+    south, north = int(y + NODE), math.ceil(y - NODE)
+    west, east = int(x + NODE), math.ceil(x - NODE)
+    return bool(
+        hidden[south, west] or hidden[south, east] or hidden[north, west] or hidden[north, east]
+    )
+
+
+@_compile
 def total(
     nodes: Floats,
     scale: Floats,
     hidden: NDArray[np.bool_],
+    hidden_cells: NDArray[np.bool_],
     corner: Floats,
     latitude: Floats,
     longitude: Floats,
@@ -80,7 +108,9 @@ def total(
     ----------
     nodes : (rows, columns, 2) coefficients of the value and of its derivative upward, per km.
     scale : (rows, 2) spline coefficients over latitude of cells per km northward and eastward.
-    hidden : (rows, columns) nodes whose neighbourhood answers NaN.
+    hidden : nodes beyond coverage, from the corner on without halo, and one row and column
+        more; next to them the answer is NaN.
+    hidden_cells : cells that have a hidden node, likewise.
     corner : south, west, latitude spacing, longitude spacing of the patch's lattice.
     latitude, longitude : (n,) degrees.
     value, gradient : (n,) and (n, 3), filled: nT and nT/km; (0, 3) leaves the gradient out.
@@ -90,7 +120,8 @@ def total(
     The index of the first position that is none, or -1.
     """
     south, west, dlat, dlon = corner[0], corner[1], corner[2], corner[3]
-    rows, columns = nodes.shape[0] - 2 * HALO - 1, nodes.shape[1] - 2 * HALO - 1
+    rows, columns = float(hidden.shape[0] - 2), float(hidden.shape[1] - 2)
+    slopes = gradient.shape[0] > 0
     for k in range(latitude.size):
         if abs(latitude[k]) > 90.0 or math.isinf(longitude[k]):
             return k
@@ -99,60 +130,33 @@ def total(
         if x < 0.0 or x >= 360.0:
             x -= 360.0 * math.floor(x / 360.0)
         x = 0.0 if x >= 360.0 - EDGE * dlon else x / dlon
-        y = _onto(y, rows)
-        x = _onto(x, columns)
-        # Written so that NaN fails it.
-        covered = y >= 0.0 and y <= rows and x >= 0.0 and x <= columns
+        on_y, on_x = min(max(y, 0.0), rows), min(max(x, 0.0), columns)
+        # Written so that NaN is not covered.
+        covered = abs(y - on_y) <= EDGE and abs(x - on_x) <= EDGE
         if covered:
-            south_row, north_row = int(y + NODE) + HALO, math.ceil(y - NODE) + HALO
-            west_column, east_column = int(x + NODE) + HALO, math.ceil(x - NODE) + HALO
-            covered = not (
-                hidden[south_row, west_column]
-                or hidden[south_row, east_column]
-                or hidden[north_row, west_column]
-                or hidden[north_row, east_column]
-            )
+            i, j = int(on_y), int(on_x)
+            covered = not (hidden_cells[i, j] and _is_hidden(hidden, on_y, on_x))
         if not covered:
             value[k] = np.nan
-            if gradient.shape[0]:
+            if slopes:
                 gradient[k, 0] = gradient[k, 1] = gradient[k, 2] = np.nan
             continue
-        i, j = int(y), int(x)
-        wy, wx, dx = _weights(y - i), _weights(x - j), _slopes(x - j)
-        dy = _slopes(y - i)
+        wy, dy = _weights(on_y - i), _slopes(on_y - i)
+        wx, dx = _weights(on_x - j), _slopes(on_x - j)
         i += HALO - 1
         j += HALO - 1
-        level = upward = north = east = cells_north = cells_east = 0.0
-        for a in range(4):
-            c0, c1, c2, c3 = (
-                nodes[i + a, j],
-                nodes[i + a, j + 1],
-                nodes[i + a, j + 2],
-                nodes[i + a, j + 3],
-            )
-            line = wx[0] * c0[0] + wx[1] * c1[0] + wx[2] * c2[0] + wx[3] * c3[0]
-            level += wy[a] * line
-            if gradient.shape[0]:
-                north += dy[a] * line
-                up = wx[0] * c0[1] + wx[1] * c1[1] + wx[2] * c2[1] + wx[3] * c3[1]
-                upward += wy[a] * up
-                slope = dx[0] * c0[0] + dx[1] * c1[0] + dx[2] * c2[0] + dx[3] * c3[0]
-                east += wy[a] * slope
-                cells_north += wy[a] * scale[i + a, 0]
-                cells_east += wy[a] * scale[i + a, 1]
-        value[k] = level
-        if gradient.shape[0]:
-            gradient[k, 0] = north * cells_north
-            gradient[k, 1] = east * cells_east
-            gradient[k, 2] = -upward
+        v0, v1 = _along(nodes, i, j, 0, wx), _along(nodes, i + 1, j, 0, wx)
+        v2, v3 = _along(nodes, i + 2, j, 0, wx), _along(nodes, i + 3, j, 0, wx)
+        value[k] = _dot(wy, v0, v1, v2, v3)
+        if not slopes:
+            continue
+        e0, e1 = _along(nodes, i, j, 0, dx), _along(nodes, i + 1, j, 0, dx)
+        e2, e3 = _along(nodes, i + 2, j, 0, dx), _along(nodes, i + 3, j, 0, dx)
+        u0, u1 = _along(nodes, i, j, 1, wx), _along(nodes, i + 1, j, 1, wx)
+        u2, u3 = _along(nodes, i + 2, j, 1, wx), _along(nodes, i + 3, j, 1, wx)
+        north = _dot(wy, scale[i, 0], scale[i + 1, 0], scale[i + 2, 0], scale[i + 3, 0])
+        east = _dot(wy, scale[i, 1], scale[i + 1, 1], scale[i + 2, 1], scale[i + 3, 1])
+        gradient[k, 0] = _dot(dy, v0, v1, v2, v3) * north
+        gradient[k, 1] = _dot(wy, e0, e1, e2, e3) * east
+        gradient[k, 2] = -_dot(wy, u0, u1, u2, u3)
     return -1
-
-
-@_compile
-def _onto(cells: float, last: int) -> float:
-    """Bring a position that rounding carried over the edge back onto it."""
-    if -EDGE <= cells < 0.0:
-        return 0.0
-    if last < cells <= last + EDGE:
-        return float(last)
-    return cells

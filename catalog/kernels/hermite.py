@@ -72,10 +72,10 @@ def bracket(levels: Floats, heights: Floats) -> Bracket:
     between = (gain > 0.0) & ~above
     spacing = np.append(np.diff(levels), 1.0)[near]
     t = np.where(between, gain / spacing, 0.0)
-    powers = t[:, None] ** np.arange(6)
-    scale = spacing[:, None] ** np.arange(3)
-    value = np.einsum("lop,np->lno", _BASIS, powers) * scale
-    slope = np.einsum("lop,np->lno", _SLOPES, powers[:, :5]) * scale / spacing[:, None]
+    powers = np.vander(t, 6, increasing=True)
+    scale = np.vander(spacing, 3, increasing=True)
+    value = (powers @ _BASIS.swapaxes(1, 2)) * scale
+    slope = (powers[:, :5] @ _SLOPES.swapaxes(1, 2)) * scale / spacing[:, None]
     # On a level only that level counts, and beyond them the outermost, as a straight line.
     alone = ~between
     value[:, alone], slope[:, alone] = 0.0, 0.0

@@ -151,7 +151,8 @@ class Anomaly:
                 index = group.index[chosen]
                 linear = _bilinear(plane, group.y[chosen], group.x[chosen])
                 answer[index] += at.bracket.linear[side, index] * linear
-        return _shaped(at, self._hide(at, answer))
+        self._hide(at, answer)
+        return _shaped(at, answer)
 
     def flags(
         self,
@@ -241,14 +242,16 @@ class Anomaly:
                 found = evaluate(self._nodes, here, family, level, slopes=slopes)
                 found = found.reshape(len(found), len(index), -1, count)
                 add_level(found, at, side, index, values, gradients)
-        return self._hide(at, values), self._hide(at, gradients)
+        self._hide(at, values, gradients)
+        return values, gradients
 
-    def _hide(self, at: Positions, answer: Floats) -> Floats:
-        """NaN where there is no answer."""
-        answer[~at.inside] = np.nan
+    def _hide(self, at: Positions, *answers: Floats) -> None:
+        """Set NaN where there is no answer."""
+        hidden = ~at.inside
         if not self._extrapolate:
-            answer[uncovered(at, flags_at(self._nodes, at))] = np.nan
-        return answer
+            hidden |= uncovered(at, flags_at(self._nodes, at))
+        for answer in answers:
+            answer[hidden] = np.nan
 
 
 def add_level(

@@ -16,12 +16,12 @@ _REMEDY = "fetch or build the release again"
 def read_bytes(path: Path, *, limit: int) -> bytes:
     """A regular file's bytes, at most `limit`; a link or anything else raises IntegrityError."""
     try:
-        with open(path, "rb", opener=_open_without_following) as file:
+        with open(path, "rb", buffering=0, opener=_open_without_following) as file:
             status = os.fstat(file.fileno())
             if not stat.S_ISREG(status.st_mode):
                 raise IntegrityError("is no regular file", where=path, remedy=_REMEDY)
             size = status.st_size
-            data = file.read(limit + 1) if size <= limit else b""
+            data = file.readall() if size <= limit else b""
     except OSError as caught:
         raise IntegrityError(
             f"cannot be read: {caught.strerror}", where=path, remedy=_REMEDY

@@ -11,11 +11,11 @@ from __future__ import annotations
 from typing import Any, TypeGuard
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from magtiles.catalog.flags import QualityFlag
 from magtiles.catalog.kernels import compiled
-from magtiles.catalog.kernels.bspline import Floats, prefilter
+from magtiles.catalog.kernels.bspline import HALO, Floats, prefilter
 from magtiles.catalog.kernels.geodesy import metres_per_degree
 from magtiles.catalog.kernels.hermite import bracket
 from magtiles.catalog.releases.anomaly import Anomaly
@@ -76,15 +76,15 @@ class _TotalKernel:
 
     def __init__(self, nodes: FlatNodes, height: float, extrapolate: bool) -> None:
         lattice = nodes.manifest.lattice
-        self._call = compiled.total
-        self._nodes = nodes.coefficients((0, 0), "total", 0, (0, 0))[0] * [1.0, 1000.0]
         north, east = metres_per_degree(lattice.tile_axes(0, 0)[0], height)
         metres = [north * lattice.latitude_spacing, east * lattice.longitude_spacing]
-        self._scale = prefilter(1000.0 / np.stack(metres, axis=-1), (0,))
-        flags = nodes.plane((0, 0), "quality_flag")
-        self._hidden = (flags & np.uint8(QualityFlag.BEYOND_COVERAGE) != 0) & (not extrapolate)
-        self._corner = np.array(
-            [lattice.south, lattice.west, lattice.latitude_spacing, lattice.longitude_spacing]
+        self._map = (
+            nodes.coefficients((0, 0), "total", 0, (0, 0))[0] * [1.0, 1000.0],
+            prefilter(1000.0 / np.stack(metres, axis=-1), (0,)),
+            *_hidden(nodes.plane((0, 0), "quality_flag"), extrapolate),
+            np.array(
+                [lattice.south, lattice.west, lattice.latitude_spacing, lattice.longitude_spacing]
+            ),
         )
 
     def __call__(
@@ -92,14 +92,22 @@ class _TotalKernel:
     ) -> tuple[Floats, Floats]:
         shape, lat, lon = _flat_positions(latitude, longitude)
         value, gradient = np.empty(len(lat)), np.empty((len(lat) if slopes else 0, 3))
-        bad = self._call(
-            self._nodes, self._scale, self._hidden, self._corner, lat, lon, value, gradient
-        )
+        bad = compiled.total(*self._map, lat, lon, value, gradient)
         if bad >= 0:
             check_positions(shape, lat, lon)
         if slopes:
             gradient = gradient.reshape((*shape, 3))
         return value.reshape(shape)[()], gradient
+
+
+def _hidden(
+    flags: NDArray[np.uint8], extrapolate: bool
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Nodes beyond coverage, and cells with such a node, as the kernel takes them."""
+    beyond = np.bitwise_and(flags, np.uint8(QualityFlag.BEYOND_COVERAGE)).astype(np.bool_)
+    core = (beyond & (not extrapolate))[HALO : 2 - HALO, HALO : 2 - HALO]
+    cells = core[:-1, :-1] | core[:-1, 1:] | core[1:, :-1] | core[1:, 1:]
+    return np.ascontiguousarray(core[:-1, :-1]), cells
 
 
 def _flat_positions(

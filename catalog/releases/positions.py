@@ -192,16 +192,18 @@ def _groups(
     cell_row, cell_column = lattice.cells(y[index], x[index])
     row, in_row = np.divmod(cell_row, lattice.tile_rows)
     column, in_column = np.divmod(cell_column, lattice.tile_columns)
-    keys = np.stack([row, column, in_row // block, in_column // block], axis=1)
-    found, member = np.unique(keys, axis=0, return_inverse=True)
+    blocks = (lattice.tile_rows - 1) // block + 1, (lattice.tile_columns - 1) // block + 1
+    shape = (*lattice.shape, *blocks)
+    keys = np.ravel_multi_index((row, column, in_row // block, in_column // block), shape)
+    found, member = np.unique(keys, return_inverse=True)
     order = np.argsort(member, kind="stable")
     ends = np.cumsum(np.bincount(member, minlength=len(found)))
-    for key, end, count in zip(found.tolist(), ends, np.diff(ends, prepend=0), strict=True):
+    for key, end, count in zip(found, ends, np.diff(ends, prepend=0), strict=True):
         part = index[order[end - count : end]]
-        r, c = key[0], key[1]
+        r, c, block_row, block_column = (int(k) for k in np.unravel_index(key, shape))
         yield Group(
             (r, c),
-            (key[2], key[3]),
+            (block_row, block_column),
             part,
             y[part] - r * lattice.tile_rows + HALO,
             x[part] - c * lattice.tile_columns + HALO,

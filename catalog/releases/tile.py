@@ -21,6 +21,10 @@ BLOCK = 96
 """Cells, each way, whose spline coefficients are made at a time: a first query pays for one
 block, not for a tile. A block has its own halo, so blocks are as seamless as tiles."""
 
+Window = tuple[slice, slice]
+
+_ALL: Window = (slice(None), slice(None))
+
 _COORDINATE_TOLERANCE = 1e-6
 """Cells by which a tile's coordinates may differ from the lattice."""
 
@@ -54,14 +58,18 @@ class Tile:
         """One variable at one level (or the whole of a two-dimensional one), halo included."""
         key = (name, level)
         if key not in self._planes:
-            variable = self._variable(name)
-            try:
-                values = variable[level] if len(variable.dimensions) == 3 else variable[:]
-            except (OSError, RuntimeError) as caught:
-                raise self._problem(f"{name} cannot be read: {caught}", "whole data") from None
-            self._planes[key] = self._finite(name, np.asarray(values))
+            self._planes[key] = self._read(name, level, _ALL)
             self.nbytes += self._planes[key].nbytes
         return self._planes[key]
+
+    def _read(self, name: str, level: int, window: Window) -> NDArray[Any]:
+        variable = self._variable(name)
+        place = (level, *window) if len(variable.dimensions) == 3 else window
+        try:
+            values = np.asarray(variable[place])
+        except (OSError, RuntimeError) as caught:
+            raise self._problem(f"{name} cannot be read: {caught}", "whole data") from None
+        return self._finite(name, values)
 
     def everything(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         """All arrays by name, and the global attributes."""
@@ -83,25 +91,23 @@ class Tile:
         key = (family, level, *block)
         if key not in self._coefficients:
             if family == "surface":
-                nodes = self._surface(window)
+                nodes = self._read(SURFACE, 0, window)[..., None].astype(np.float64)
             else:
                 nodes = self._hermite(family, level, window)
             self._coefficients[key] = prefilter(nodes)
             self.nbytes += self._coefficients[key].nbytes
         return self._coefficients[key], origin
 
-    def _window(self, block: tuple[int, int]) -> tuple[tuple[slice, slice], tuple[int, int]]:
+    def _window(self, block: tuple[int, int]) -> tuple[Window, tuple[int, int]]:
         first = (block[0] * BLOCK, block[1] * BLOCK)
         last = [min(f + BLOCK, n) + 2 * HALO + 1 for f, n in zip(first, self._core, strict=True)]
         return (slice(first[0], last[0]), slice(first[1], last[1])), first
 
-    def _surface(self, window: tuple[slice, slice]) -> Floats:
-        return np.asarray(self.plane(SURFACE)[window], np.float64)[..., None]
-
-    def _hermite(self, family: str, level: int, window: tuple[slice, slice]) -> Floats:
+    def _hermite(self, family: str, level: int, window: Window) -> Floats:
         names = required_variables(family) + (AMBIENT if family == "total" else ())
-        planes = {name: self.plane(name, 0 if name in AMBIENT else level)[window] for name in names}
-        surface = self.plane(SURFACE)[window] if self._manifest.has_reference_surface else 0.0
+        planes = {name: self._read(name, level, window) for name in names}
+        with_surface = self._manifest.has_reference_surface
+        surface = self._read(SURFACE, 0, window) if with_surface else 0.0
         lattice = self._manifest.lattice
         latitude = lattice.tile_axes(self.record.row, self.record.column)[0][window[0], None]
         nodes = hermite_planes(

@@ -15,8 +15,8 @@ from magtiles.catalog.releases.tile_table import CONTRACT, LEVELS, TILE_VARIABLE
 from magtiles.schemas import contracts
 from magtiles.stages.release.atomic import sync
 
-_CHUNK = 512
-"""Most nodes of a chunk each way; a chunk is one level, as queries need one or two."""
+_CHUNK = 128
+"""Most nodes of a chunk each way, of one level: a query unpacks little more than it needs."""
 
 _DEFLATE = 1
 """Levels 2 to 4 made the tiles of a synthetic map 0.9 % smaller and took up to 8 % longer."""
