@@ -16,6 +16,7 @@ UV := uv==0.13.9
 PIP := pip --disable-pip-version-check --no-input --quiet
 FOLDERS := schemas catalog stages pipeline
 LINKS := $(FOLDERS:%=build/ns/magtiles/%)
+PATH_OF := $(BIN)/python -c 'import json, sys; print(json.load(sys.stdin)["path"])'
 RELEASES := $(PRODUCT:%=release/%)
 
 # Matplotlib wants a folder to write to even where there is no home.
@@ -34,7 +35,9 @@ tiles: $(RELEASES) ## Build and validate PRODUCT="a.toml b.toml" (default: the d
 
 # Each product is built, then validated, by itself, so that `make -j` may run several at once.
 $(RELEASES): release/%: % $(READY)
-	release=$$($(MAGTILES) build $* --store $(STORE)) && $(MAGTILES) validate "$$release"
+	@echo '$(MAGTILES) build $* --store $(STORE), and validate'
+	@built=$$($(MAGTILES) build $* --store $(STORE) --json) && \
+	  $(MAGTILES) validate "$$(printf '%s' "$$built" | $(PATH_OF))"
 
 build/sample/demo.toml: pipeline/sample.py catalog/kernels/dipole.py $(READY)
 	$(MAGTILES) sample $(@D)

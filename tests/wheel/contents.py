@@ -20,8 +20,9 @@ def build_wheel(folder: Path) -> Path:
     """Build the wheel of the checkout as the only one in `folder`."""
     for stale in (folder, ROOT / "build" / "lib"):
         shutil.rmtree(stale, ignore_errors=True)
-    command = ["wheel", "--quiet", "--no-deps", "--no-build-isolation", "--wheel-dir", str(folder)]
-    subprocess.run([sys.executable, "-m", "pip", *command, str(ROOT)], check=True)
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
+    options = ["--no-deps", "--no-build-isolation", "--wheel-dir", str(folder)]
+    subprocess.run([*pip, "wheel", *options, str(ROOT)], check=True)
     (wheel,) = folder.glob("*.whl")
     return wheel
 

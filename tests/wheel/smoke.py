@@ -65,8 +65,8 @@ def constraints_of(lock: Path) -> str:
 def use_pipeline(environment: Environment) -> Path:
     """Make the sample, build and validate its release; returns the folder of the release."""
     environment.run("magtiles", "sample", "sample")
-    built = environment.run("magtiles", "build", "sample/demo.toml", "--store", "store")
-    release = environment.folder / built.splitlines()[-1]
+    built = environment.run("magtiles", "build", "sample/demo.toml", "--store", "store", "--json")
+    release = environment.folder / json.loads(built)["path"]
     environment.run("magtiles", "validate", str(release))
     return release
 
