@@ -27,7 +27,7 @@ export MPLCONFIGDIR := $(CURDIR)/build/matplotlib
 .PHONY: tiles $(RELEASES) test check validate bench wheel-check lock clean help
 
 tiles: $(RELEASES) ## Build and validate PRODUCT="a.toml b.toml" (default: the demo), `-j` for side by side
-	@printf '\n%s\n' 'Releases are in $(STORE). Next, with RELEASE one of them:' \
+	@printf '%s\n' '' 'Releases are in $(STORE). Next, with RELEASE one of them:' \
 	  '  $(MAGTILES) info RELEASE' \
 	  '  $(MAGTILES) plot RELEASE' \
 	  '  $(MAGTILES) query RELEASE --lat LAT --lon LON --height METRES' \
