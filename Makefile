@@ -69,8 +69,8 @@ wheel-check: $(READY) ## Build the wheel, compare it with the tree, use it in tw
 lock: ## Resolve the dependencies anew (the only target that needs uv, which it fetches)
 	$(PYTHON) -m venv build/lock
 	build/lock/bin/python -m $(PIP) install '$(UV)'
-	build/lock/bin/uv pip compile --quiet --upgrade pyproject.toml --extra pipeline --group dev \
-	  --universal --fork-strategy fewest --python-version 3.11 --generate-hashes \
+	build/lock/bin/uv pip compile --quiet --upgrade --system-certs pyproject.toml \
+	  --extra pipeline --group dev --universal --fork-strategy fewest --python-version 3.11 --generate-hashes \
 	  --no-header --no-emit-index-url --no-emit-find-links --output-file $(LOCK)
 
 clean: ## Remove all that make made but .venv
