@@ -111,45 +111,42 @@ def common_lattice(tiles: Sequence[MeasuredTile]) -> Lattice:
             expected=f"one tile for each of {rows} x {columns} places",
         )
     first, last = places[0, 0], places[rows - 1, columns - 1]
-    south, dlat = _axis(first.latitude, last.latitude, _before(places, 0))
-    west, dlon = _axis(first.longitude, last.longitude, _before(places, 1))
+    south, dlat = _axis(first.latitude)
+    west, dlon = _axis(first.longitude)
+    tile_rows, tile_columns = _core_cells(first)
+    last_rows, last_columns = _core_cells(last)
     lattice = Lattice(
         south=south,
         west=west,
         latitude_spacing=dlat,
         longitude_spacing=dlon,
-        rows=_before(places, 0) + int(last.attributes["core_rows"]),
-        columns=_before(places, 1) + int(last.attributes["core_columns"]),
-        tile_rows=int(first.attributes["core_rows"]),
-        tile_columns=int(first.attributes["core_columns"]),
+        rows=(rows - 1) * tile_rows + last_rows,
+        columns=(columns - 1) * tile_columns + last_columns,
+        tile_rows=tile_rows,
+        tile_columns=tile_columns,
     )
     for tile in tiles:
         _check_place(tile, lattice)
     return lattice
 
 
-def _before(places: dict[tuple[int, int], MeasuredTile], axis: int) -> int:
-    """Cells before the last tile along an axis."""
-    key = ("core_rows", "core_columns")[axis]
-    last = max(place[axis] for place in places)
-    return last * int(places[0, 0].attributes[key])
+def _core_cells(tile: MeasuredTile) -> tuple[int, int]:
+    return int(tile.attributes["core_rows"]), int(tile.attributes["core_columns"])
 
 
-def _axis(
-    first: NDArray[np.float64], last: NDArray[np.float64], before: int
-) -> tuple[float, float]:
-    """Start and spacing of an axis from its ends, as the round numbers they were made from."""
-    cells = before + len(last) - 1
-    spacing = (last[-1] - first[0]) / cells
-    round_spacing, start = float(f"{spacing:.12g}"), float(f"{first[HALO]:.12g}")
-    nodes = start + (np.arange(len(first)) - HALO) * round_spacing
-    exact = np.abs(nodes - first).max() < 1e-12 and abs(round_spacing - spacing) * cells < 1e-12
-    return (start, round_spacing) if exact else (float(first[HALO]), float(spacing))
+def _axis(nodes: NDArray[np.float64]) -> tuple[float, float]:
+    """Start and spacing of a tile's axis, as the round numbers it was made from if it was."""
+    start, spacing = float(nodes[HALO]), float((nodes[-1] - nodes[0]) / (len(nodes) - 1))
+    round_start, round_spacing = float(f"{start:.12g}"), float(f"{spacing:.12g}")
+    rounded = round_start + (np.arange(len(nodes)) - HALO) * round_spacing
+    if np.abs(rounded - nodes).max() < 1e-12:
+        return round_start, round_spacing
+    return start, spacing
 
 
 def _check_place(tile: MeasuredTile, lattice: Lattice) -> None:
     place = tile.entry["row"], tile.entry["column"]
-    core = int(tile.attributes["core_rows"]), int(tile.attributes["core_columns"])
+    core = _core_cells(tile)
     wanted = lattice.tile_axes(*place)
     spacings = (lattice.latitude_spacing, lattice.longitude_spacing)
     if core != lattice.core(*place):
