@@ -45,15 +45,16 @@ _LOCAL_CELLS = 8.0
 class MissingData:
     """Standard deviation of each product for want of data, on a thinned copy of the map.
 
-    `variance` holds "total", "vector" (nT^2) and "tensor" (nT^2/km^2), each (rows, columns);
-    node (i, j) of the map lies at ((i + 0.5) / thinning - 0.5, ...) of them.
+    `variance` holds "total", "vector" (nT^2) and "tensor" (nT^2/km^2), each (rows, columns),
+    and the map's "roughness" there: typical local power of its short wavelengths over
+    their mean. Node (i, j) of the map lies at ((i + 0.5) / thinning - 0.5, ...) of them.
     """
 
     variance: dict[str, Real]
     thinning: int
 
     def at(self, group: str, row: Real, column: Real) -> Real:
-        """Variance at fractional rows and columns of the map."""
+        """One of `variance` at fractional rows and columns of the map."""
         out = np.empty(row.shape)
         scale = 1.0 / self.thinning
         evaluate_linear(self.variance[group], row, column, scale, 0.5 * scale - 0.5, out)
@@ -70,12 +71,12 @@ def missing_data(plane_map: PlaneMap, field: AnomalousField, height_gain: float)
         for group, squares in experiment.squared_errors(random, height_gain).items():
             totals[group] = totals.get(group, 0.0) + squares / REALISATIONS
     width = [max(1.0, height_gain / 2 / d) for d in experiment.wavenumbers.spacing]
-    amplitude = experiment.local_power()
+    gap_power, typical_power = experiment.local_power(height_gain)
     variance = {
-        group: ndimage.gaussian_filter(total, width, mode="nearest") * amplitude
+        group: ndimage.gaussian_filter(total * gap_power, width, mode="nearest")
         for group, total in totals.items()
     }
-    return MissingData(variance, thinning)
+    return MissingData({**variance, "roughness": typical_power}, thinning)
 
 
 @dataclass(frozen=True)
@@ -84,6 +85,7 @@ class _Experiment:
 
     values: Real
     gaps: Mask
+    void: Mask
     beyond: Mask
     distance: Real
     taper_m: float
@@ -109,6 +111,7 @@ class _Experiment:
         return cls(
             values,
             gaps,
+            void,
             beyond,
             distance_to(~gaps, spacing),
             exterior_taper(plane_map.spacing),
@@ -136,18 +139,25 @@ class _Experiment:
             "tensor": self._mean_square(field, potential, TENSOR),
         }
 
-    def local_power(self) -> Real:
-        """Local power of the anomaly's short wavelengths relative to its mean.
+    def local_power(self, height_gain: float) -> tuple[Real, Real]:
+        """Local power of the anomaly's short wavelengths over their mean: for gaps, and typical.
 
         The random fields are alike everywhere; a real map is rough here and smooth there, and
-        what a gap hides is as rough as what surrounds it.
+        what a gap hides is most likely as rough as what surrounds it. Errors at the border come
+        from afar: for them it is taken from mean squares. Elsewhere, and around voids, typical
+        is what mean absolute values say, lest one sharp anomaly speak for its neighbourhood.
         """
         weight = (~self.gaps).astype(float)
-        if not self.gaps.all() and np.ptp(self.values[~self.gaps]) == 0.0:
-            return np.ones(self.values.shape)
+        if np.ptp(self.values[~self.gaps]) == 0.0:
+            return np.ones(self.values.shape), np.ones(self.values.shape)
         rough = self.values - self._smooth(self.values, weight, _ROUGH_CELLS)
-        ratio = self._smooth(rough**2, weight, _LOCAL_CELLS)
-        return np.asarray(np.clip(ratio / np.average(ratio, weights=weight), *_AMPLITUDE_LIMITS))
+        mean = np.average(rough**2, weights=weight)
+        squares = self._smooth(rough**2, weight, _LOCAL_CELLS) / mean
+        typical = np.pi / 2 * self._smooth(np.abs(rough), weight, _LOCAL_CELLS) ** 2 / mean
+        reach = height_gain + 2 * max(self.wavenumbers.spacing)
+        near_void = distance_to(self.void, self.wavenumbers.spacing) < reach
+        gaps = np.where(near_void, typical, squares)
+        return np.clip(gaps, *_AMPLITUDE_LIMITS), np.clip(typical, *_AMPLITUDE_LIMITS)
 
     @staticmethod
     def _smooth(values: Real, weight: Real, width: float) -> Real:

@@ -1,8 +1,9 @@
 """One sigma of a continued map's own error, for total, vector and tensor.
 
-Three independent parts are added in quadrature: the survey's noise, carried through the
-transform's own gain; what its lines could not resolve (aliasing); and the want of data in voids
-and beyond the border.
+Four independent parts are added in quadrature: the survey's noise, carried through the
+transform's own gain; the shortest wavelengths, which the transform fades out; what the survey's
+lines could not resolve (aliasing); and the want of data in voids and beyond the border. The
+second and third are larger where the map is rough.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from magtiles.stages.field.interpolate import evaluate_linear
 from magtiles.stages.field.missing import missing_data
 from magtiles.stages.field.prepare import PlaneMap
 from magtiles.stages.field.solve import AnomalousField
-from magtiles.stages.field.spectral import TENSOR, VECTOR, Inversion
+from magtiles.stages.field.spectral import TENSOR, VECTOR, Inversion, fade
 
 Real = NDArray[np.float64]
 
@@ -39,13 +40,15 @@ def uncertainty(
     """
     missing = missing_data(plane_map, field, height_gain)
     noise = noise_gain(field, height_gain)
+    faded = faded_power(field, height_gain, float(np.mean(plane_map.sigma**2)))
     alias = alias_gain(grid, field.inversion, height_gain)
     survey = _sample(plane_map.sigma, row, column) ** 2
     signal = float(np.var(plane_map.values[~(plane_map.void | plane_map.beyond)]))
+    rough = missing.at("roughness", row, column)
     return {
         group: np.sqrt(
             survey * noise[group]
-            + signal * alias[group]
+            + rough * (faded[group] + signal * alias[group])
             + missing.at(group, row, column)
             + _FLOOR[group] ** 2
         )
@@ -56,12 +59,33 @@ def uncertainty(
 def noise_gain(field: AnomalousField, height_gain: float) -> dict[str, float]:
     """Variance of each group per unit variance of white noise on the map's nodes (Parseval)."""
     w = field.wavenumbers
-    lift = w.continuation(height_gain, field.noise_to_signal) ** 2 * w.multiplicity
-    potential = np.abs(field.inversion.potential) ** 2 * lift
-    y2, x2, k2 = w.y**2, w.x**2, w.k**2
+    lift = w.continuation(height_gain, field.noise_to_signal) ** 2
+    return _group_means(field, lift)
+
+
+def faded_power(
+    field: AnomalousField, height_gain: float, noise_variance: float
+) -> dict[str, float]:
+    """Mean square (nT^2, nT^2/km^2) of what the window takes from each group, less its noise.
+
+    From the map's own spectrum; what the window fades of the survey's noise is no loss.
+    """
+    w = field.wavenumbers
+    lost = ((1.0 - w.window) * np.exp(-w.k * max(height_gain, 0.0))) ** 2
+    interior = field.padding.map_shape[0] * field.padding.map_shape[1]
+    power = np.abs(field.total) ** 2 / interior - noise_variance
+    return {group: max(mean, 0.0) for group, mean in _group_means(field, lost * power).items()}
+
+
+def _group_means(field: AnomalousField, total_power: Real) -> dict[str, float]:
+    """Mean variance of each group's components, from the spectral power of the total."""
+    w = field.wavenumbers
     count = w.shape[0] * w.shape[1]
+    total = total_power * w.multiplicity
+    potential = np.abs(field.inversion.potential) ** 2 * total
+    y2, x2, k2 = w.y**2, w.x**2, w.k**2
     return {
-        "total": float(lift.sum()) / count,
+        "total": float(total.sum()) / count,
         "vector": float((potential * k2).sum()) * 2 / len(VECTOR) / count,
         "tensor": float((potential * (2 * k2**2 - y2 * x2)).sum()) * _PER_KM2 / len(TENSOR) / count,
     }
@@ -72,7 +96,7 @@ def alias_gain(grid: xr.Dataset, inversion: Inversion, height_gain: float) -> di
 
     At a height h over its sources a field's power falls as exp(-2 k h), so that the fraction
     exp(-2 pi h / dx) lies beyond the Nyquist wavenumber K = pi / dx of lines dx apart (Canciani
-    and Raquet 2016, eq. 1). It is folded to 2K - k and continued upward from there.
+    and Raquet 2016, eq. 1). It is folded to 2K - k, windowed and continued upward from there.
     Zero where the grid does not state `line_spacing_m` and `source_distance_m`.
     """
     if "line_spacing_m" not in grid.attrs or "source_distance_m" not in grid.attrs:
@@ -82,7 +106,8 @@ def alias_gain(grid: xr.Dataset, inversion: Inversion, height_gain: float) -> di
     k = nyquist * (np.arange(400) + 0.5) / 400
     folded = np.exp(-2 * (nyquist - k) * distance)
     weight = folded / folded.sum() * np.exp(-2 * nyquist * distance)
-    lifted = weight * np.exp(-2 * k * height_gain)
+    cell = max(inversion.wavenumbers.spacing)
+    lifted = weight * (fade(k * cell / np.pi) * np.exp(-k * height_gain)) ** 2
     ring = _ring(inversion)
     return {
         "total": float(lifted.sum()),
