@@ -26,7 +26,7 @@ def is_geographic(grid: xr.Dataset) -> bool:
 
 def steps(grid: xr.Dataset) -> tuple[float, float]:
     """Mean node spacing along rows and columns, in the axes' own units."""
-    return tuple((a[-1] - a[0]) / max(a.size - 1, 1) for a in axes(grid))  # type: ignore[return-value]
+    return tuple((a[-1] - a[0]) / max(a.size - 1, 1) for a in axes(grid))
 
 
 def true_spacing(grid: xr.Dataset) -> tuple[float, float]:

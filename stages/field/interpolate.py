@@ -12,7 +12,7 @@ Real = NDArray[np.float64]
 Floats = NDArray[np.floating[Any]]
 
 
-@njit(inline="always")  # type: ignore[misc]
+@njit(inline="always")
 def _weights(t: float) -> tuple[float, float, float, float]:
     """Cubic B-spline weights of the four coefficients around a fractional position t."""
     s = 1.0 - t
@@ -24,7 +24,7 @@ def _weights(t: float) -> tuple[float, float, float, float]:
     )
 
 
-@njit(parallel=True, cache=True, nogil=True)  # type: ignore[misc]
+@njit(parallel=True, cache=True, nogil=True)
 def evaluate_spline(
     coefficients: Real, row: Real, column: Real, scale: float, shift: Real, out: Floats
 ) -> None:
@@ -53,7 +53,7 @@ def evaluate_spline(
             out[i, j] = total
 
 
-@njit(parallel=True, cache=True, nogil=True)  # type: ignore[misc]
+@njit(parallel=True, cache=True, nogil=True)
 def evaluate_linear(
     values: Real, row: Real, column: Real, scale: float, shift: float, out: Floats
 ) -> None:

@@ -105,7 +105,7 @@ class _Experiment:
         spacing = plane_map.spacing[0] * thinning, plane_map.spacing[1] * thinning
         before = [int(np.ceil(o / thinning)) for o in field.padding.offset]
         shape = [odd_fast_length(n + 2 * o) for n, o in zip(values.shape, before, strict=True)]
-        padding = Padding((before[0], before[1]), values.shape, (shape[0], shape[1]))  # type: ignore[arg-type]
+        padding = Padding((before[0], before[1]), values.shape, (shape[0], shape[1]))
         inversion = Inversion(Wavenumbers(padding.shape, spacing), field.inversion.direction)
         noise = float(np.mean(plane_map.sigma**2)) / thinning**2
         return cls(

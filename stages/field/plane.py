@@ -198,12 +198,13 @@ def _candidates(
     }
     third = float(np.ptp(latitude)) / 3
     parallels = {"lat_1": middle["lat_0"] - third, "lat_2": middle["lat_0"] + third}
-    yield pyproj.Proj(proj="tmerc", **middle, **shape), False
-    yield pyproj.Proj(proj="stere", **middle, **shape), False
+    yield pyproj.Proj({"proj": "tmerc", **middle, **shape}), False
+    yield pyproj.Proj({"proj": "stere", **middle, **shape}), False
     if abs(middle["lat_0"]) > 1.0:
-        yield pyproj.Proj(proj="lcc", **middle, **parallels, **shape), False
+        yield pyproj.Proj({"proj": "lcc", **middle, **parallels, **shape}), False
     else:
-        yield pyproj.Proj(proj="merc", lon_0=middle["lon_0"], lat_ts=third, **shape), False
+        mercator = {"proj": "merc", "lon_0": middle["lon_0"], "lat_ts": third}
+        yield pyproj.Proj({**mercator, **shape}), False
 
 
 def _scale(projection: pyproj.Proj, longitude: Real, latitude: Real) -> tuple[float, float]:

@@ -154,7 +154,7 @@ def _plane_axes(grid: xr.Dataset, plane: Plane) -> tuple[Real, Real]:
 
 
 def _resample(values: Real, row: Real, column: Real) -> Real:
-    padding = plan_padding(values.shape, (1.0, 1.0), 0.0)  # type: ignore[arg-type]
+    padding = plan_padding(values.shape, (1.0, 1.0), 0.0)
     wavenumbers = Wavenumbers(padding.shape, (1.0, 1.0))
     spectrum = forward(pad(values, padding)) * wavenumbers.window
     coefficients = oversampled_spline(spectrum, wavenumbers, slice(None), _OVERSAMPLING)

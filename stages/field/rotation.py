@@ -10,7 +10,7 @@ Real = NDArray[np.float64]
 Single = NDArray[np.float32]
 
 
-@njit(parallel=True, cache=True, nogil=True)  # type: ignore[misc]
+@njit(parallel=True, cache=True, nogil=True)
 def rotate_to_ned(products: Single, north: Single, ambient: Single, mean_direction: Real) -> None:
     """Turn products (9, m, n), in place, from axes y, x, d to north, east, down.
 

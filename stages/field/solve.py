@@ -89,7 +89,7 @@ def plane_direction(plane: Plane, ambient: AmbientSource) -> Callable[[Real, Rea
 def solve(plane_map: PlaneMap, ambient: AmbientSource, height_gain: float) -> AnomalousField:
     """The anomalous field of a map, ready to be continued by `height_gain` (m)."""
     spacing = plane_map.spacing
-    padding = plan_padding(plane_map.values.shape, spacing, height_gain)  # type: ignore[arg-type]
+    padding = plan_padding(plane_map.values.shape, spacing, height_gain)
     wavenumbers = Wavenumbers(padding.shape, spacing)
     directions = on_lattice(
         plane_direction(plane_map.plane, ambient), plane_map.y, plane_map.x, STEP_M

@@ -49,12 +49,12 @@ class Wavenumbers:
     @cached_property
     def y(self) -> Real:
         """Along y, shape (ny, 1)."""
-        return 2 * np.pi * scipy.fft.fftfreq(self.shape[0], self.spacing[0])[:, None]
+        return np.asarray(2 * np.pi * scipy.fft.fftfreq(self.shape[0], self.spacing[0])[:, None])
 
     @cached_property
     def x(self) -> Real:
         """Along x, shape (1, nx // 2 + 1)."""
-        return 2 * np.pi * scipy.fft.rfftfreq(self.shape[1], self.spacing[1])[None, :]
+        return np.asarray(2 * np.pi * scipy.fft.rfftfreq(self.shape[1], self.spacing[1])[None, :])
 
     @cached_property
     def k(self) -> Real:
@@ -145,7 +145,7 @@ class Inversion:
 def factors(w: Wavenumbers, product: str) -> Iterator[Complex | Real]:
     """The factors (each broadcastable) whose product takes phi to `product`, in SI per metre."""
     for axis in product:
-        yield w.k if axis == "d" else 1j * (w.y if axis == "y" else w.x)
+        yield w.k if axis == "d" else np.complex128(1j) * (w.y if axis == "y" else w.x)
 
 
 def product_spectrum(

@@ -55,7 +55,7 @@ class Nodes:
 
 def geographic_target(latitude: Axis, longitude: Axis) -> Target:
     """A lattice uniform in WGS84 degrees; its nodes are first + i * spacing exactly."""
-    rows, columns = (a + d * np.arange(n) for a, d, n in (latitude, longitude))
+    rows, columns = (a + d * np.arange(n, dtype=np.float64) for a, d, n in (latitude, longitude))
     return Target(("latitude", "longitude"), rows, columns, lambda lat, lon: (lat, lon), STEP_DEG)
 
 

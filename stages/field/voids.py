@@ -75,7 +75,7 @@ def distance_to(target: Mask, spacing: tuple[float, float]) -> Real:
 
 def exterior_taper(spacing: tuple[float, float]) -> float:
     """Distance (m) over which the fill beyond a survey's outline fades to the mean."""
-    return _TAPER_CELLS * float(np.hypot(*spacing)) / np.sqrt(2.0)
+    return float(_TAPER_CELLS * np.hypot(*spacing) / np.sqrt(2.0))
 
 
 def extend(values: Real, beyond: Mask, distance: Real, taper_m: float) -> Real:
@@ -124,7 +124,7 @@ def _halve(values: Real) -> Real:
     return np.asarray(even[::2, ::2] + even[1::2, ::2] + even[::2, 1::2] + even[1::2, 1::2])
 
 
-@njit(cache=True, nogil=True)  # type: ignore[misc]
+@njit(cache=True, nogil=True)
 def _relax(u: Real, nodes: NDArray[np.int64], sweeps: int) -> None:
     """Gauss-Seidel sweeps of the biharmonic stencil over `nodes`, forth and back, in place."""
     ny, nx = u.shape
