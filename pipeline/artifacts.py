@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
-import secrets
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,38 +10,12 @@ import xarray as xr
 
 from magtiles.schemas import contracts
 from magtiles.schemas.errors import ContractError, FormatError, MagtilesError
+from magtiles.stages.release.atomic import atomic_path
 from magtiles.stages.release.tile_file import write_tile
 
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _DEFLATE_LIMIT = 1032
 """The most that zlib can expand; a file that declares more data than this holds none of it."""
-
-
-@contextlib.contextmanager
-def atomic_path(path: Path) -> Iterator[Path]:
-    """A temporary path in the folder of `path` that replaces it when the block succeeds.
-
-    The bytes are on disk (fsync) before the rename; when the block fails nothing is left.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
-    try:
-        yield temporary
-        _sync(temporary)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    if os.name == "posix":  # Windows cannot open a folder
-        _sync(path.parent)
-
-
-def _sync(path: Path) -> None:
-    # Windows syncs only what is open for writing; a folder can only be opened for reading.
-    descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def write_artifact(dataset: xr.Dataset, path: Path, contract: str) -> None:
@@ -54,10 +24,18 @@ def write_artifact(dataset: xr.Dataset, path: Path, contract: str) -> None:
     Tiles are packed as a release holds them. The caller has checked the dataset. Raises
     MagtilesError when it cannot be written.
     """
-    if contract.startswith("anomaly-tile/"):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_tile(dataset, path)
-        return
+    try:
+        if contract.startswith("anomaly-tile/"):
+            write_tile(dataset, path)
+        else:
+            _write_plain(dataset, path, contract)
+    except (OSError, RuntimeError) as caught:  # netCDF4 says RuntimeError for a full disk
+        raise MagtilesError(
+            f"cannot be written ({caught})", where=path, remedy="check space and permissions"
+        ) from caught
+
+
+def _write_plain(dataset: xr.Dataset, path: Path, contract: str) -> None:
     plain = dataset.drop_encoding()
     plain.attrs |= {"Conventions": "CF-1.11", "contract": contracts.resolve(contract)}
     encoding: dict[Any, Any] = {}
@@ -65,12 +43,7 @@ def write_artifact(dataset: xr.Dataset, path: Path, contract: str) -> None:
         plain[name].attrs = _flags_like(plain[name])
         encoding[name] = {"_FillValue": None}  # missing is NaN; a fill mark would turn u1 to float
     with atomic_path(path) as temporary:
-        try:
-            plain.to_netcdf(temporary, engine="netcdf4", format="NETCDF4", encoding=encoding)
-        except (OSError, RuntimeError) as caught:  # netCDF4 says RuntimeError for a full disk
-            raise MagtilesError(
-                f"cannot be written ({caught})", where=path, remedy="check space and permissions"
-            ) from caught
+        plain.to_netcdf(temporary, engine="netcdf4", format="NETCDF4", encoding=encoding)
 
 
 def open_artifact(path: Path, *, cache: bool = True) -> xr.Dataset:

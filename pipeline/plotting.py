@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtiles.catalog.flags import QualityFlag
-from magtiles.pipeline.artifacts import atomic_path
+from magtiles.stages.release.atomic import atomic_path
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

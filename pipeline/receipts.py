@@ -17,8 +17,8 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
-from magtiles.pipeline.artifacts import atomic_path
 from magtiles.stages.declare import Params, Stage
+from magtiles.stages.release.atomic import atomic_path
 
 _PACKAGES = ("numpy", "scipy", "xarray", "netCDF4", "pyproj", "rasterio", "numba")
 _CODE = ("magtiles.schemas", "magtiles.catalog", "magtiles.stages")

@@ -12,8 +12,8 @@ import rasterio.io
 import xarray as xr
 
 from magtiles.catalog.kernels.dipole import TENSOR
-from magtiles.pipeline.artifacts import atomic_path
 from magtiles.pipeline.synthetic import DEMO, ConstantField, Sample, SampleSpec, synthesize
+from magtiles.stages.release.atomic import atomic_path
 
 __all__ = [
     "DEMO",

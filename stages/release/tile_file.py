@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ import xarray as xr
 from magtiles.catalog.flags import flag_attributes
 from magtiles.catalog.releases.tile_table import CONTRACT, LEVELS, TILE_VARIABLES, TileVariable
 from magtiles.schemas import contracts
-from magtiles.stages.release.atomic import sync
+from magtiles.stages.release.atomic import atomic_path
 
 _CHUNK = 128
 """Most nodes of a chunk each way, of one level: a query unpacks little more than it needs."""
@@ -39,18 +38,12 @@ def write_tile(dataset: xr.Dataset, path: Path) -> None:
     Raises ContractError when the dataset is no tile.
     """
     contracts.check(dataset, CONTRACT, where=path)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with netCDF4.Dataset(part, "w", format="NETCDF4") as file:
-            _set_attributes(file, dataset.attrs)
-            for name in LEVELS:
-                file.createDimension(name, dataset.sizes[name])
-            for name in sorted(set(TILE_VARIABLES) & set(map(str, dataset.variables))):
-                _write_variable(file, name, dataset)
-        sync(part)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    with atomic_path(path) as temporary, netCDF4.Dataset(temporary, "w", format="NETCDF4") as file:
+        _set_attributes(file, dataset.attrs)
+        for name in LEVELS:
+            file.createDimension(name, dataset.sizes[name])
+        for name in sorted(set(TILE_VARIABLES) & set(map(str, dataset.variables))):
+            _write_variable(file, name, dataset)
 
 
 def _write_variable(file: Any, name: str, dataset: xr.Dataset) -> None:
