@@ -21,7 +21,6 @@ from magtiles.stages.field.spectral import (
     LOW_INCLINATION_SINE,
     TENSOR,
     VECTOR,
-    oversampled_spline,
 )
 from magtiles.stages.field.target import Axis, Nodes, Target, geographic_target, locate, own_target
 from magtiles.stages.field.uncertainty import uncertainty
@@ -104,13 +103,8 @@ def evaluate_products(field: AnomalousField, nodes: Nodes, height_gain: float) -
     last = int((nodes.row.max() + offset[0]) * _OVERSAMPLING) + 4
     rows = slice(max(first, 0), max(min(last, w.shape[0] * _OVERSAMPLING), 8))
     shift = np.array([offset[0] * _OVERSAMPLING - rows.start, offset[1] * _OVERSAMPLING], float)
-    potential = field.potential_at(height_gain)
     for product, values in zip(("total", *VECTOR, *TENSOR), out, strict=True):
-        if product == "total":
-            spectrum = field.total_at(height_gain)
-        else:
-            spectrum = field.component(potential, product)
-        coefficients = oversampled_spline(spectrum, w, rows, _OVERSAMPLING)
+        coefficients = field.spline(product, height_gain, rows, _OVERSAMPLING)
         evaluate_spline(coefficients, nodes.row, nodes.column, float(_OVERSAMPLING), shift, values)
     rotate_to_ned(out, nodes.north, nodes.ambient, np.array(field.inversion.direction))
     return out

@@ -17,6 +17,7 @@ from scipy import ndimage
 from magtiles.stages.field.interpolate import evaluate_linear
 from magtiles.stages.field.padding import Padding, pad
 from magtiles.stages.field.prepare import PlaneMap
+from magtiles.stages.field.product import product_spectrum
 from magtiles.stages.field.solve import AnomalousField
 from magtiles.stages.field.spectral import (
     TENSOR,
@@ -129,14 +130,16 @@ class _Experiment:
             np.where(self.gaps, np.nan, observed), self.beyond, self.distance, self.taper_m
         )
         estimate = forward(pad(filled, self.padding))
-        lift = w.continuation(height_gain)
-        total = (estimate - truth * self.inversion.theta) * lift
-        field = AnomalousField(self.padding, w, self.inversion, estimate, 0.0)
-        potential = (estimate * self.inversion.potential - truth) * lift
+        # As a total anomaly, so that one routine makes all products of the difference.
+        potential = self.inversion.potential.copy()
+        potential[0, 0] = np.inf
+        misfit = estimate - truth / potential
         return {
-            "total": self._square(total),
-            "vector": self._mean_square(field, potential, VECTOR),
-            "tensor": self._mean_square(field, potential, TENSOR),
+            "total": self._mean_square(
+                estimate - truth * self.inversion.theta, height_gain, ("total",)
+            ),
+            "vector": self._mean_square(misfit, height_gain, VECTOR),
+            "tensor": self._mean_square(misfit, height_gain, TENSOR),
         }
 
     def local_power(self, height_gain: float) -> tuple[Real, Real]:
@@ -167,14 +170,17 @@ class _Experiment:
             total / np.maximum(ndimage.gaussian_filter(weight, width, mode="constant"), 1e-12)
         )
 
-    def _mean_square(
-        self, field: AnomalousField, potential: Complex, products: tuple[str, ...]
-    ) -> Real:
-        squares = [self._square(field.component(potential, p)) for p in products]
+    def _mean_square(self, total: Complex, height_gain: float, products: tuple[str, ...]) -> Real:
+        squares = [
+            inverse(
+                product_spectrum(total, self.inversion, product, height_gain),
+                self.wavenumbers.shape,
+                *self.padding.interior,
+            )
+            ** 2
+            for product in products
+        ]
         return np.asarray(np.mean(squares, axis=0))
-
-    def _square(self, spectrum: Complex) -> Real:
-        return inverse(spectrum, self.wavenumbers.shape, *self.padding.interior) ** 2
 
 
 def _amplitude(values: Real, gaps: Mask, inversion: Inversion, noise: float) -> Real:

@@ -15,7 +15,8 @@ from magtiles.stages.field.geometry import axes, true_spacing
 from magtiles.stages.field.interpolate import evaluate_spline
 from magtiles.stages.field.padding import pad, plan_padding
 from magtiles.stages.field.plane import STEP_M, Plane, choose_plane, index_of, on_lattice
-from magtiles.stages.field.spectral import Wavenumbers, forward, oversampled_spline
+from magtiles.stages.field.product import dense_spline_spectrum
+from magtiles.stages.field.spectral import Inversion, Wavenumbers, forward, inverse
 
 Real = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -154,10 +155,12 @@ def _plane_axes(grid: xr.Dataset, plane: Plane) -> tuple[Real, Real]:
 
 
 def _resample(values: Real, row: Real, column: Real) -> Real:
-    padding = plan_padding(values.shape, (1.0, 1.0), 0.0)
-    wavenumbers = Wavenumbers(padding.shape, (1.0, 1.0))
-    spectrum = forward(pad(values, padding)) * wavenumbers.window
-    coefficients = oversampled_spline(spectrum, wavenumbers, slice(None), _OVERSAMPLING)
+    padding = plan_padding((values.shape[0], values.shape[1]), (1.0, 1.0), 0.0)
+    inversion = Inversion(Wavenumbers(padding.shape, (1.0, 1.0)), (0.0, 0.0, 1.0))
+    total = forward(pad(values, padding))
+    dense = dense_spline_spectrum(total, inversion, "total", 0.0, 0.0, _OVERSAMPLING)
+    shape = padding.shape[0] * _OVERSAMPLING, padding.shape[1] * _OVERSAMPLING
+    coefficients = inverse(dense, shape, slice(None), slice(None))
     out = np.empty(row.shape)
     shift = np.array(padding.offset, dtype=float) * _OVERSAMPLING
     evaluate_spline(coefficients, row, column, float(_OVERSAMPLING), shift, out)

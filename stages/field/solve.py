@@ -12,11 +12,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit, prange
 
 from magtiles.stages.field.direction import AmbientSource
 from magtiles.stages.field.padding import Padding, pad, plan_padding
 from magtiles.stages.field.plane import STEP_M, Plane, on_lattice
 from magtiles.stages.field.prepare import PlaneMap
+from magtiles.stages.field.product import dense_spline_spectrum, product_spectrum
 from magtiles.stages.field.spectral import (
     VECTOR,
     Complex,
@@ -25,7 +27,6 @@ from magtiles.stages.field.spectral import (
     Wavenumbers,
     forward,
     inverse,
-    product_spectrum,
 )
 
 _log = logging.getLogger(__name__)
@@ -54,20 +55,22 @@ class AnomalousField:
     total: Complex
     noise_to_signal: float
 
-    def total_at(self, height_gain: float) -> Complex:
-        """Spectrum of the anomaly along the mean direction, `height_gain` m higher (nT)."""
-        return self.total * self.wavenumbers.continuation(height_gain, self.noise_to_signal)
+    def spectrum(self, product: str, height_gain: float) -> Complex:
+        """Spectrum of a product ("total", "y", "yd", ...) `height_gain` m above the map."""
+        return product_spectrum(
+            self.total, self.inversion, product, height_gain, self.noise_to_signal
+        )
 
-    def potential_at(self, height_gain: float) -> Complex:
-        """Spectrum of the potential (nT m) `height_gain` m above the map's surface."""
-        return self.total_at(height_gain) * self.inversion.potential
+    def spline(self, product: str, height_gain: float, rows: slice, factor: int) -> Real:
+        """Cubic B-spline coefficients of a product, `factor` times denser than the map.
 
-    def component(self, potential: Complex, product: str) -> Complex:
-        """Spectrum of a vector or tensor component, with the vector's mean set."""
-        spectrum = product_spectrum(potential, self.wavenumbers, product)
-        if product in VECTOR:
-            spectrum[0, 0] = self.total[0, 0] * self.inversion.mean_vector[VECTOR.index(product)]
-        return spectrum
+        Shape (rows, factor * nx); `rows` counts rows of the dense padded lattice.
+        """
+        dense = dense_spline_spectrum(
+            self.total, self.inversion, product, height_gain, self.noise_to_signal, factor
+        )
+        shape = self.padding.shape[0] * factor, self.padding.shape[1] * factor
+        return inverse(dense, shape, rows, slice(None))
 
 
 def plane_direction(plane: Plane, ambient: AmbientSource) -> Callable[[Real, Real], Direction]:
@@ -109,23 +112,23 @@ def _substitute(
     padded: Real, padding: Padding, inversion: Inversion, variation: list[Real]
 ) -> Complex:
     """Spectrum of T - df.B, by substitution until a further round would change it by 0.1 %."""
-    observed = forward(padded)
-    total, size = observed, float(np.linalg.norm(padded - padded.mean()))
+    total = forward(padded)
+    size = float(np.linalg.norm(padded - padded.mean()))
+    if size == 0.0 or max(np.abs(part).max() for part in variation) < _TOLERANCE / 10:
+        return total
+    previous = np.zeros(padded.shape)
     change = first = np.inf
     for _ in range(_ROUNDS):
-        if size == 0.0 or max(np.abs(part).max() for part in variation) < _TOLERANCE / 10:
-            break
         correction = _varying_part(total, padding, inversion, variation)
-        refined = observed - forward(correction)
-        previous, change = change, _distance(refined, total, inversion.wavenumbers) / size
-        if change > previous:
+        last, change = change, float(np.linalg.norm(correction - previous)) / size
+        if change > last:
             _log.warning(
                 "the ambient direction varies too much over this map to be followed exactly "
                 "(last change %.1f %%): split the region",
                 100 * change,
             )
             break
-        total, first = refined, min(first, change)
+        total, previous, first = forward(padded - correction), correction, min(first, change)
         if change * first < _TOLERANCE:
             break
     return total
@@ -135,24 +138,21 @@ def _varying_part(
     total: Complex, padding: Padding, inversion: Inversion, variation: list[Real]
 ) -> Real:
     """df.B (nT) on the padded plane; df is held constant beyond the map's border."""
-    field = AnomalousField(padding, inversion.wavenumbers, inversion, total, 0.0)
-    potential = total * inversion.potential
     out = np.zeros(padding.shape)
     everything = slice(None)
-    after = [
-        m - o - n for m, o, n in zip(padding.shape, padding.offset, padding.map_shape, strict=True)
-    ]
-    widths = list(zip(padding.offset, after, strict=True))
     for axis, part in zip(VECTOR, variation, strict=True):
-        component = field.component(potential, axis)
+        component = product_spectrum(total, inversion, axis, 0.0)
         values = inverse(component, padding.shape, everything, everything)
-        values *= np.pad(part, widths, mode="edge")
-        out += values
+        add_product(out, values, part, padding.offset)
     return out
 
 
-def _distance(a: Complex, b: Complex, w: Wavenumbers) -> float:
-    """Norm in space of the difference of two spectra (Parseval)."""
-    power = np.abs(a - b) ** 2
-    power[0, 0] = 0.0
-    return float(np.sqrt((power * w.multiplicity).sum() / (w.shape[0] * w.shape[1])))
+@njit(parallel=True, cache=True, nogil=True)
+def add_product(out: Real, values: Real, factor: Real, offset: tuple[int, int]) -> None:
+    """Add values * factor to `out`; factor covers it from `offset` on, and its edge extends."""
+    rows, columns = factor.shape
+    for i in prange(out.shape[0]):
+        r = min(max(i - offset[0], 0), rows - 1)
+        for j in range(out.shape[1]):
+            c = min(max(j - offset[1], 0), columns - 1)
+            out[i, j] += values[i, j] * factor[r, c]

@@ -2,7 +2,8 @@
 
 Axes are those of a plane: y (grid north), x (grid east) and d (down). Outside its sources the
 anomalous field is the gradient of a harmonic potential, B = grad(phi), so that with wavenumbers
-k_y, k_x and k = |k| every product is phi's spectrum times a factor (Mount 2018, eq. 90-98)::
+k_y, k_x and k = |k| every product is phi's spectrum times a factor (Mount 2018, eq. 90-98;
+`product.fill_product` multiplies)::
 
     B_y, B_x, B_d   = i k_y, i k_x, k
     G_ij = d_i B_j  = the products of two of these,   G_dd = -(G_yy + G_xx)
@@ -13,7 +14,6 @@ with f the unit vector of the ambient field. Continuation upward by h multiplies
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -32,7 +32,6 @@ LOW_INCLINATION_SINE = np.sin(np.radians(20.0))
 _DAMPING = 0.1
 _PASS = 0.75
 
-_METRES_PER_KM = 1000.0
 _WORKERS = -1
 
 
@@ -68,23 +67,28 @@ class Wavenumbers:
         count[0, 0] = 1.0
         return count
 
-    @cached_property
-    def window(self) -> Real:
-        """1 up to three quarters of the Nyquist wavenumber along each axis, then fading to 0.
+    @property
+    def windows(self) -> tuple[Real, Real]:
+        """Factors along y (ny,) and x (nx // 2 + 1,): 1 up to three quarters of Nyquist, then less.
 
         A sharp cut there makes every spike or undersampled source ring along its whole row and
         column; faded over a quarter of the band, the ringing dies within some cells.
         """
-        sides = [fade(k * d / np.pi) for k, d in zip((self.y, self.x), self.spacing, strict=True)]
-        return np.asarray(sides[0] * sides[1])
+        return fade(self.y[:, 0] * self.spacing[0] / np.pi), fade(
+            self.x[0] * self.spacing[1] / np.pi
+        )
+
+    @property
+    def window(self) -> Real:
+        """Both windows, shape (ny, nx // 2 + 1)."""
+        return np.multiply.outer(*self.windows)
 
     def continuation(self, height_gain: float, noise_to_signal: float = 0.0) -> Real:
         """exp(-k h), windowed; for h < 0 damped where it would amplify noise beyond signal."""
         factor = np.exp(-self.k * height_gain)
-        factor *= self.window
         if height_gain < 0:
             factor /= 1.0 + noise_to_signal * factor**2
-        return factor
+        return np.asarray(factor * self.window)
 
 
 def fade(fraction: Real) -> Real:
@@ -142,29 +146,6 @@ class Inversion:
         return fy / 2 / power, fx / 2 / power, fd / power
 
 
-def factors(w: Wavenumbers, product: str) -> Iterator[Complex | Real]:
-    """The factors (each broadcastable) whose product takes phi to `product`, in SI per metre."""
-    for axis in product:
-        yield w.k if axis == "d" else np.complex128(1j) * (w.y if axis == "y" else w.x)
-
-
-def product_spectrum(
-    potential: Complex, w: Wavenumbers, product: str, scratch: Complex | None = None
-) -> Complex:
-    """Spectrum of a vector (nT) or tensor (nT/km) component from that of the potential (nT m)."""
-    scale = _METRES_PER_KM if len(product) == 2 else 1.0
-    first, *rest = factors(w, product)
-    if product in ("yy", "yx", "xx"):
-        # Both factors are imaginary: their product is real and cheaper.
-        real = -scale * (w.y if product[0] == "y" else w.x)
-        out = np.multiply(potential, real, out=scratch)
-        return np.multiply(out, w.y if product[1] == "y" else w.x, out=out)
-    out = np.multiply(potential, first * scale, out=scratch)
-    for factor in rest:
-        np.multiply(out, factor, out=out)
-    return out
-
-
 def forward(values: Real, shape: tuple[int, int] | None = None) -> Complex:
     """Real two-dimensional transform, of `values` extended by zeros to `shape`."""
     return np.asarray(scipy.fft.rfft2(values, s=shape, workers=_WORKERS))
@@ -177,33 +158,17 @@ def inverse(spectrum: Complex, shape: tuple[int, int], rows: slice, columns: sli
     return np.asarray(values[:, columns])
 
 
-def oversampled_spline(spectrum: Complex, w: Wavenumbers, rows: slice, factor: int = 2) -> Real:
-    """Cubic B-spline coefficients of a field sampled `factor` times denser than its transform.
+def spline_prefilter(k: Real, spacing: float) -> Real:
+    """From samples `spacing` apart to cubic B-spline coefficients, at wavenumbers k (rad/m).
 
-    Zero-padding the spectrum resamples a band-limited field without loss; the spline's
-    prefilter is a division in the same domain (exact for the periodic field), so that the
-    coefficients cost no further pass. `rows` counts rows of the dense lattice.
+    In the transform of a periodic field the prefilter of the spline is but a division.
     """
-    ny = w.shape[0]
-    dense = ny * factor, w.shape[1] * factor
-    scale = factor**2 / (
-        _spline_symbol(w.y * w.spacing[0] / factor) * _spline_symbol(w.x * w.spacing[1] / factor)
-    )
-    half = (ny + 1) // 2
-    padded = np.zeros((dense[0], spectrum.shape[1]), np.complex128)
-    np.multiply(spectrum[:half], scale[:half], out=padded[:half])
-    np.multiply(spectrum[half:], scale[half:], out=padded[half - ny :])
-    return inverse(padded, dense, rows, slice(None))
-
-
-def _spline_symbol(phase: Real) -> Real:
-    """Transfer of a cubic B-spline from coefficients to samples at `phase` rad per sample."""
-    return (2.0 + np.cos(phase)) / 3.0
+    return np.asarray(3.0 / (2.0 + np.cos(k * spacing)))
 
 
 def odd_fast_length(minimum: int) -> int:
     """The smallest odd transform length, at least `minimum`, with small prime factors."""
-    length = scipy.fft.next_fast_len(minimum, real=True)
+    length = scipy.fft.next_fast_len(minimum)
     while length % 2 == 0:
-        length = scipy.fft.next_fast_len(length + 1, real=True)
+        length = scipy.fft.next_fast_len(length + 1)
     return int(length)
