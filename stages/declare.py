@@ -10,11 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, get_args
 
 import pydantic
 import xarray as xr
-from pydantic_core import PydanticUndefined
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails, PydanticUndefined
 
 from magtiles.schemas.errors import MagtilesError, ParameterError
 
@@ -89,24 +90,77 @@ def _first_problem(
 ) -> MagtilesError:
     # A misspelt key also makes its true name missing: name the misspelling first.
     problem = min(caught.errors(), key=lambda e: e["type"] != "extra_forbidden")
-    key = ".".join(str(part) for part in problem["loc"])
+    location = problem["loc"]
+    absent = problem["type"] == "missing"
+    if absent and isinstance(location[-1], int):  # a short list, not a missing key
+        absent, location = False, location[:-1]
+    key, table, field = _place(kind, location)
     if problem["type"] == "extra_forbidden":
-        known = ", ".join(sorted(kind.model_fields)) or "none"
+        known = ", ".join(sorted(table.model_fields)) or "none"
         return error(
             f"unknown key '{key}'",
             where=where,
             expected=f"one of {known}",
             remedy="correct or remove it",
         )
-    if problem["type"] == "missing":
-        field = kind.model_fields.get(key)
-        meaning = f" ({field.description})" if field is not None and field.description else ""
+    meaning = f" ({field.description})" if field is not None and field.description else ""
+    if absent:
         return error(f"key '{key}' is missing{meaning}", where=where, remedy=f"add {key} = ...")
     return error(
-        f"key '{key}' is {problem['input']!r}",
+        f"key '{key}' is {_plain(problem['input'])!r}",
         where=where,
-        expected=problem["msg"].removeprefix("Input should be ").removeprefix("Value error, "),
+        expected=_expectation(problem, meaning),
     )
+
+
+def _place(
+    kind: type[Params], location: tuple[int | str, ...]
+) -> tuple[str, type[Params], FieldInfo | None]:
+    """A key as TOML writes it, the innermost table that holds it, and its field if known."""
+    key, table, field = "", kind, None
+    inner: type[Params] | None = kind
+    for part in location:
+        if isinstance(part, int):
+            key += f"[{part}]"
+            continue
+        key = f"{key}.{part}" if key else part
+        if inner is not None:
+            table, field = inner, inner.model_fields.get(part)
+            inner = None if field is None else _table(field.annotation)
+    return key, table, field
+
+
+def _table(annotation: Any) -> type[Params] | None:
+    """The table that a field holds, if it is one (or none)."""
+    for kind in (annotation, *get_args(annotation)):
+        if isinstance(kind, type) and issubclass(kind, Params):
+            return kind
+    return None
+
+
+_WORDS = {
+    "tuple_type": "a list",
+    "model_type": "a table",
+    "dict_type": "a table",
+    "bool_type": "true or false",
+}
+"""What pydantic expects, in the words of TOML where its own are of Python."""
+
+
+def _expectation(problem: ErrorDetails, meaning: str) -> str:
+    if problem["type"] == "string_pattern_mismatch":
+        return f"text that matches {problem['ctx']['pattern']}{meaning}"
+    if problem["type"] in ("missing", "too_long"):
+        return f"a list of another length{meaning}"
+    said = problem["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
+    return _WORDS.get(problem["type"], said)
+
+
+def _plain(value: Any) -> Any:
+    """A value as TOML has it: tuples are lists again."""
+    if isinstance(value, tuple):
+        return [_plain(v) for v in value]
+    return value
 
 
 def _tuples(value: Any) -> Any:

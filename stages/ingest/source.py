@@ -123,22 +123,20 @@ def load_source(path: Path) -> Source:
     tables = load_toml(path)
     for name in tables:
         if name not in ("source", "grid"):
-            raise SourceError(
-                f"unknown table [{name}]", where=path.name, expected="[source], [grid]"
-            )
+            raise SourceError(f"unknown table [{name}]", where=path, expected="[source], [grid]")
     if "source" not in tables:
-        raise SourceError("table [source] is missing", where=path.name, remedy="add it")
+        raise SourceError("table [source] is missing", where=path, remedy="add it")
     header: SourceParams = parse_params(
-        SourceParams, tables["source"], where=f"{path.name} [source]", error=SourceError
+        SourceParams, tables["source"], where=f"{path} [source]", error=SourceError
     )
     if header.kind != "anomaly-grid":
         raise SourceError(
             f"key 'kind' is '{header.kind}'",
-            where=f"{path.name} [source]",
+            where=f"{path} [source]",
             expected="'anomaly-grid'",
         )
     grid: IngestGridParams = parse_params(
-        IngestGridParams, tables.get("grid", {}), where=f"{path.name} [grid]", error=SourceError
+        IngestGridParams, tables.get("grid", {}), where=f"{path} [grid]", error=SourceError
     )
     return Source(path, header, grid)
 
@@ -148,17 +146,17 @@ def load_toml(path: Path) -> dict[str, dict[str, Any]]:
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as caught:
-        raise SourceError(f"cannot be read: {caught.strerror}", where=path.name) from None
+        raise SourceError(f"cannot be read: {caught.strerror}", where=path) from None
     except UnicodeDecodeError as caught:
-        raise SourceError(f"byte {caught.start} is not UTF-8", where=path.name) from None
+        raise SourceError(f"byte {caught.start} is not UTF-8", where=path) from None
     except tomllib.TOMLDecodeError as caught:
-        raise SourceError(f"is not TOML: {caught}", where=path.name) from None
+        raise SourceError(f"is not TOML: {caught}", where=path) from None
     for name, table in document.items():
         if not isinstance(table, dict):
             raise SourceError(
                 f"key '{name}' stands outside any table",
-                where=path.name,
-                remedy="move it under [source] or [grid]",
+                where=path,
+                remedy="move it under the [table] it belongs to",
             )
     return document
 
@@ -229,7 +227,7 @@ def _check_digest(path: Path, source: Source) -> None:
     if found != expected.lower():
         raise IntegrityError(
             f"sha256 is {found}",
-            where=path.name,
+            where=path,
             expected=f"{expected} as {source.path.name} states",
             remedy="fetch the file again, or correct the digest if the data set was replaced",
         )
