@@ -103,8 +103,9 @@ def evaluate_products(field: AnomalousField, nodes: Nodes, height_gain: float) -
     last = int((nodes.row.max() + offset[0]) * _OVERSAMPLING) + 4
     rows = slice(max(first, 0), max(min(last, w.shape[0] * _OVERSAMPLING), 8))
     shift = np.array([offset[0] * _OVERSAMPLING - rows.start, offset[1] * _OVERSAMPLING], float)
+    level = field.level(height_gain, _OVERSAMPLING)
     for product, values in zip(("total", *VECTOR, *TENSOR), out, strict=True):
-        coefficients = field.spline(product, height_gain, rows, _OVERSAMPLING)
+        coefficients = level.values(product, rows, slice(None))
         evaluate_spline(coefficients, nodes.row, nodes.column, float(_OVERSAMPLING), shift, values)
     rotate_to_ned(out, nodes.north, nodes.ambient, np.array(field.inversion.direction))
     return out

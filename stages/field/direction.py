@@ -12,7 +12,7 @@ import ppigrf
 import xarray as xr
 from numpy.typing import NDArray
 
-from magtiles.schemas.errors import ParameterError
+from magtiles.schemas.errors import CoverageError, ParameterError
 
 Real = NDArray[np.float64]
 
@@ -71,13 +71,26 @@ def igrf_direction(
     return Ambient(north / strength, east / strength, -up / strength)
 
 
+def _check_epoch(date: datetime.datetime, coefficients: Path | None) -> None:
+    """Raise CoverageError for a date that the coefficients do not cover."""
+    file = () if coefficients is None else (str(coefficients),)
+    epochs = ppigrf.ppigrf.read_shc(*file)[0].index
+    if not epochs[0] <= date <= epochs[-1]:
+        raise CoverageError(
+            f"reference_epoch {date:%Y-%m-%d} is outside the span of the IGRF",
+            expected=f"{epochs[0]:%Y-%m-%d} to {epochs[-1]:%Y-%m-%d}",
+            remedy="correct it, or give inclination_deg and declination_deg",
+        )
+
+
 class AmbientSource:
     """Where the ambient direction of a map comes from: given angles, or the IGRF at its epoch.
 
     The IGRF is of the generation that `reference_field` names, if it is at hand. The directions
     of all core-field models agree within hundredths of a degree, so for others the newest
     stands in.
-    Raises ParameterError if only one of the two angles is given.
+    Raises ParameterError if only one of the two angles is given, CoverageError for an epoch
+    that the IGRF does not cover.
     """
 
     def __init__(
@@ -91,6 +104,8 @@ class AmbientSource:
         self._angles = inclination_deg, declination_deg
         self._date = datetime.datetime.fromisoformat(grid.attrs["reference_epoch"])
         self._coefficients = reference_coefficients(str(grid.attrs["reference_field"]))
+        if inclination_deg is None:
+            _check_epoch(self._date, self._coefficients)
         self._height = float(np.mean(grid["height"].values))
 
     def at(self, latitude: Real, longitude: Real) -> Ambient:

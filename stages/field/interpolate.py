@@ -26,7 +26,7 @@ def _weights(t: float) -> tuple[float, float, float, float]:
 
 @njit(parallel=True, cache=True, nogil=True)
 def evaluate_spline(
-    coefficients: Real, row: Real, column: Real, scale: float, shift: Real, out: Floats
+    coefficients: Floats, row: Real, column: Real, scale: float, shift: Real, out: Floats
 ) -> None:
     """Cubic B-spline values at scale * (row, column) + shift, each of `out`'s shape (m, n).
 

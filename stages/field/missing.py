@@ -17,7 +17,7 @@ from scipy import ndimage
 from magtiles.stages.field.interpolate import evaluate_linear
 from magtiles.stages.field.padding import Padding, pad
 from magtiles.stages.field.prepare import PlaneMap
-from magtiles.stages.field.product import product_spectrum
+from magtiles.stages.field.product import Level
 from magtiles.stages.field.solve import AnomalousField
 from magtiles.stages.field.spectral import (
     TENSOR,
@@ -171,14 +171,9 @@ class _Experiment:
         )
 
     def _mean_square(self, total: Complex, height_gain: float, products: tuple[str, ...]) -> Real:
+        level = Level(total, self.inversion, height_gain)
         squares = [
-            inverse(
-                product_spectrum(total, self.inversion, product, height_gain),
-                self.wavenumbers.shape,
-                *self.padding.interior,
-            )
-            ** 2
-            for product in products
+            level.values(product, *self.padding.interior).astype(float) ** 2 for product in products
         ]
         return np.asarray(np.mean(squares, axis=0))
 

@@ -138,12 +138,13 @@ def on_lattice(
     a hundred times faster than evaluating each of millions of nodes.
     `rows` (m,) and `columns` (n,) give arrays (m, n); the coarse points are `step` apart.
     """
-    coarse = _coarse(rows, step), _coarse(columns, step)
+    coarse = coarse_axis(rows, step), coarse_axis(columns, step)
     values = function(*np.meshgrid(*coarse, indexing="ij"))
     return tuple(np.asarray(RectBivariateSpline(*coarse, v)(rows, columns)) for v in values)
 
 
-def _coarse(axis: Real, step: float) -> Real:
+def coarse_axis(axis: Real, step: float) -> Real:
+    """At least eight points over the span of an axis, at most `step` apart."""
     low, high = float(axis[0]), float(axis[-1])
     if low == high:
         low, high = low - step / 8, high + step / 8

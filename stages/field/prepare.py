@@ -15,8 +15,8 @@ from magtiles.stages.field.geometry import axes, true_spacing
 from magtiles.stages.field.interpolate import evaluate_spline
 from magtiles.stages.field.padding import pad, plan_padding
 from magtiles.stages.field.plane import STEP_M, Plane, choose_plane, index_of, on_lattice
-from magtiles.stages.field.product import dense_spline_spectrum
-from magtiles.stages.field.spectral import Inversion, Wavenumbers, forward, inverse
+from magtiles.stages.field.product import Level
+from magtiles.stages.field.spectral import Inversion, Wavenumbers, forward
 
 Real = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -158,9 +158,8 @@ def _resample(values: Real, row: Real, column: Real) -> Real:
     padding = plan_padding((values.shape[0], values.shape[1]), (1.0, 1.0), 0.0)
     inversion = Inversion(Wavenumbers(padding.shape, (1.0, 1.0)), (0.0, 0.0, 1.0))
     total = forward(pad(values, padding))
-    dense = dense_spline_spectrum(total, inversion, "total", 0.0, 0.0, _OVERSAMPLING)
-    shape = padding.shape[0] * _OVERSAMPLING, padding.shape[1] * _OVERSAMPLING
-    coefficients = inverse(dense, shape, slice(None), slice(None))
+    level = Level(total, inversion, 0.0, density=_OVERSAMPLING)
+    coefficients = level.values("total", slice(None), slice(None))
     out = np.empty(row.shape)
     shift = np.array(padding.offset, dtype=float) * _OVERSAMPLING
     evaluate_spline(coefficients, row, column, float(_OVERSAMPLING), shift, out)

@@ -16,9 +16,9 @@ from numba import njit, prange
 
 from magtiles.stages.field.direction import AmbientSource
 from magtiles.stages.field.padding import Padding, pad, plan_padding
-from magtiles.stages.field.plane import STEP_M, Plane, on_lattice
+from magtiles.stages.field.plane import STEP_M, Plane, coarse_axis
 from magtiles.stages.field.prepare import PlaneMap
-from magtiles.stages.field.product import dense_spline_spectrum, product_spectrum
+from magtiles.stages.field.product import Level, Single
 from magtiles.stages.field.spectral import (
     VECTOR,
     Complex,
@@ -26,7 +26,6 @@ from magtiles.stages.field.spectral import (
     Real,
     Wavenumbers,
     forward,
-    inverse,
 )
 
 _log = logging.getLogger(__name__)
@@ -55,22 +54,9 @@ class AnomalousField:
     total: Complex
     noise_to_signal: float
 
-    def spectrum(self, product: str, height_gain: float) -> Complex:
-        """Spectrum of a product ("total", "y", "yd", ...) `height_gain` m above the map."""
-        return product_spectrum(
-            self.total, self.inversion, product, height_gain, self.noise_to_signal
-        )
-
-    def spline(self, product: str, height_gain: float, rows: slice, factor: int) -> Real:
-        """Cubic B-spline coefficients of a product, `factor` times denser than the map.
-
-        Shape (rows, factor * nx); `rows` counts rows of the dense padded lattice.
-        """
-        dense = dense_spline_spectrum(
-            self.total, self.inversion, product, height_gain, self.noise_to_signal, factor
-        )
-        shape = self.padding.shape[0] * factor, self.padding.shape[1] * factor
-        return inverse(dense, shape, rows, slice(None))
+    def level(self, height_gain: float, density: int = 1) -> Level:
+        """The field `height_gain` m above the map's surface, as samples or spline coefficients."""
+        return Level(self.total, self.inversion, height_gain, self.noise_to_signal, density)
 
 
 def plane_direction(plane: Plane, ambient: AmbientSource) -> Callable[[Real, Real], Direction]:
@@ -94,9 +80,7 @@ def solve(plane_map: PlaneMap, ambient: AmbientSource, height_gain: float) -> An
     spacing = plane_map.spacing
     padding = plan_padding(plane_map.values.shape, spacing, height_gain)
     wavenumbers = Wavenumbers(padding.shape, spacing)
-    directions = on_lattice(
-        plane_direction(plane_map.plane, ambient), plane_map.y, plane_map.x, STEP_M
-    )
+    directions = _coarse_directions(plane_map, ambient)
     mean = np.array([part.mean() for part in directions])
     mean /= np.linalg.norm(mean)
     inversion = Inversion(wavenumbers, (float(mean[0]), float(mean[1]), float(mean[2])))
@@ -106,6 +90,15 @@ def solve(plane_map: PlaneMap, ambient: AmbientSource, height_gain: float) -> An
     signal = max(float(plane_map.values.var()), np.finfo(float).tiny)
     noise_to_signal = float(np.mean(plane_map.sigma**2)) / signal
     return AnomalousField(padding, wavenumbers, inversion, total, noise_to_signal)
+
+
+def _coarse_directions(plane_map: PlaneMap, ambient: AmbientSource) -> Direction:
+    """Ambient unit vector (y, x, d) at points some 25 km apart, from corner to corner of the map.
+
+    Between them it is linear within 1e-5.
+    """
+    y, x = (coarse_axis(axis, STEP_M) for axis in (plane_map.y, plane_map.x))
+    return plane_direction(plane_map.plane, ambient)(*np.meshgrid(y, x, indexing="ij"))
 
 
 def _substitute(
@@ -139,20 +132,33 @@ def _varying_part(
 ) -> Real:
     """df.B (nT) on the padded plane; df is held constant beyond the map's border."""
     out = np.zeros(padding.shape)
-    everything = slice(None)
+    surface = Level(total, inversion, 0.0)
     for axis, part in zip(VECTOR, variation, strict=True):
-        component = product_spectrum(total, inversion, axis, 0.0)
-        values = inverse(component, padding.shape, everything, everything)
-        add_product(out, values, part, padding.offset)
+        values = surface.values(axis, slice(None), slice(None))
+        add_product(out, values, part, padding.offset, padding.map_shape)
     return out
 
 
 @njit(parallel=True, cache=True, nogil=True)
-def add_product(out: Real, values: Real, factor: Real, offset: tuple[int, int]) -> None:
-    """Add values * factor to `out`; factor covers it from `offset` on, and its edge extends."""
-    rows, columns = factor.shape
+def add_product(
+    out: Real, values: Single, factor: Real, offset: tuple[int, int], shape: tuple[int, int]
+) -> None:
+    """Add values * factor to `out` (m, n).
+
+    `factor`, on a coarse lattice, covers the part of `shape` from `offset` on, from corner to
+    corner; it is taken linearly between its nodes, and its edge extends beyond them.
+    """
+    last_row, last_column = factor.shape[0] - 1, factor.shape[1] - 1
     for i in prange(out.shape[0]):
-        r = min(max(i - offset[0], 0), rows - 1)
+        r = (i - offset[0]) * last_row / (shape[0] - 1.0)
+        r = min(max(r, 0.0), last_row)
+        r0 = min(int(r), last_row - 1)
+        t = r - r0
         for j in range(out.shape[1]):
-            c = min(max(j - offset[1], 0), columns - 1)
-            out[i, j] += values[i, j] * factor[r, c]
+            c = (j - offset[1]) * last_column / (shape[1] - 1.0)
+            c = min(max(c, 0.0), last_column)
+            c0 = min(int(c), last_column - 1)
+            u = c - c0
+            low = factor[r0, c0] + u * (factor[r0, c0 + 1] - factor[r0, c0])
+            high = factor[r0 + 1, c0] + u * (factor[r0 + 1, c0 + 1] - factor[r0 + 1, c0])
+            out[i, j] += values[i, j] * (low + t * (high - low))

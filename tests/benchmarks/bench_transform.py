@@ -22,23 +22,23 @@ from numpy.typing import NDArray
 from magtiles.stages.field.direction import AmbientSource
 from magtiles.stages.field.padding import plan_padding
 from magtiles.stages.field.prepare import PlaneMap, prepare
-from magtiles.stages.field.solve import AnomalousField, solve
-from magtiles.stages.field.spectral import TENSOR, VECTOR, inverse
+from magtiles.stages.field.solve import solve
+from magtiles.stages.field.spectral import TENSOR, VECTOR
 
 Real = NDArray[np.float64]
 
-SIZE, SPACING_M, GAIN_M = 2048, 1000.0, 2000.0
+SIZE, SPACING_M, GAIN_M = 2048, 250.0, 500.0
 ROUNDS = 5
 
 
 def example() -> xr.Dataset:
-    """A map of smoothed noise in UTM zone 10, anomaly-grid/1."""
+    """A map of smoothed noise, 512 km a side in the north-west of the USA, anomaly-grid/1."""
     rng = np.random.default_rng(1)
     k = np.hypot(*np.meshgrid(np.fft.fftfreq(SIZE), np.fft.rfftfreq(SIZE), indexing="ij"))
     spectrum = scipy.fft.rfft2(rng.standard_normal((SIZE, SIZE))) * np.exp(-18 * k)
     values = scipy.fft.irfft2(spectrum, s=(SIZE, SIZE))
     axis = SPACING_M * (np.arange(SIZE) - SIZE / 2)
-    crs = pyproj.CRS(proj="lcc", lat_0=46, lon_0=-120, lat_1=41, lat_2=51, datum="WGS84")
+    crs = pyproj.CRS(proj="tmerc", lat_0=46, lon_0=-120, datum="WGS84")
     metres = {"units": "m"}
     return xr.Dataset(
         {
@@ -58,16 +58,11 @@ def example() -> xr.Dataset:
     )
 
 
-def nine_products(plane_map: PlaneMap, ambient: AmbientSource) -> list[Real]:
+def nine_products(plane_map: PlaneMap, ambient: AmbientSource) -> list[NDArray[np.float32]]:
     """What is measured: all products of one level on the map's own nodes."""
     field = solve(plane_map, ambient, GAIN_M)
-    return [_on_map(product, field) for product in ("total", *VECTOR, *TENSOR)]
-
-
-def _on_map(product: str, field: AnomalousField) -> Real:
-    return inverse(
-        field.spectrum(product, GAIN_M), field.wavenumbers.shape, *field.padding.interior
-    )
+    level = field.level(GAIN_M)
+    return [level.values(p, *field.padding.interior) for p in ("total", *VECTOR, *TENSOR)]
 
 
 def bare_ffts(padded: Real) -> None:
