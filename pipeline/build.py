@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import concurrent.futures
+import contextlib
 import logging
 import multiprocessing
 import os
@@ -21,7 +22,7 @@ from magtiles.pipeline.preview import write_preview
 from magtiles.pipeline.product import Product, load_product
 from magtiles.pipeline.progress import Progress, silent
 from magtiles.pipeline.runner import StageResult, run_stage
-from magtiles.schemas.errors import CoverageError
+from magtiles.schemas.errors import CoverageError, ParameterError
 from magtiles.stages.declare import Stage
 from magtiles.stages.field import components, crop, voids
 from magtiles.stages.field.direction import reference_coefficients
@@ -70,6 +71,25 @@ def build_product(
     Raises MagtilesError subclasses for bad sources, data, parameters and versions.
     """
     wanted = load_product(product)
+    with _asked_by(product):
+        return _build(wanted, store, work, data, progress)
+
+
+@contextlib.contextmanager
+def _asked_by(product: Path) -> Iterator[None]:
+    """Name the product in errors about what it asks for."""
+    try:
+        yield
+    except (ParameterError, CoverageError) as error:
+        where = f"{product} {error.where or ''}".rstrip()
+        raise type(error)(
+            error.what, where=where, expected=error.expected, remedy=error.remedy
+        ) from error
+
+
+def _build(
+    wanted: Product, store: Path, work: Path, data: Path | None, progress: Progress
+) -> PublishResult:
     folder = work / wanted.product.name
     steps = _Steps(progress, total=4 + len(wanted.anomaly.heights_m))
     survey = _survey(wanted, folder, data, steps)
@@ -115,7 +135,7 @@ def _heights(wanted: Product, survey_height: float) -> list[float]:
     if below and not wanted.anomaly.allow_downward_continuation:
         raise CoverageError(
             f"heights_m holds {min(below):g}, below the survey at {survey_height:g} m",
-            where=f"{wanted.path} anomaly",
+            where="anomaly",
             expected=f"heights of {survey_height:g} m and more",
             remedy="raise it, or set allow_downward_continuation = true (flagged, noisier)",
         )
@@ -149,7 +169,7 @@ def _level(
     for angle in ("inclination_deg", "declination_deg"):
         if (value := getattr(wanted.anomaly, angle)) is not None:
             params[angle] = value
-    out = folder / f"level-{height:g}m.nc"
+    out = folder / f"level-{height:.12g}m.nc"
     return steps.run(components.STAGE, {"grid": survey.grid}, out, params)
 
 

@@ -86,7 +86,8 @@ def _guarded(command: ModuleType, arguments: argparse.Namespace) -> int:
         place = f"{error.filename}: " if error.filename else ""
         return _report(error, f"{place}{error.strerror or error}", arguments, BAD_DATA)
     except MemoryError as error:
-        return _report(error, "not enough memory", arguments, BAD_DATA)
+        text = "not enough memory: ask for less at once (a region, a wider spacing), or add some"
+        return _report(error, text, arguments, BAD_DATA)
     except Exception as error:  # a fault of ours; still not a bare traceback
         text = f"internal error, please report it: {type(error).__name__}: {error}"
         return _report(error, text + " (-vv shows where)", arguments, BAD_DATA)

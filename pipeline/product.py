@@ -13,21 +13,40 @@ from magtiles.schemas.errors import SourceError
 from magtiles.stages.declare import Params, parse_params, quantity
 from magtiles.stages.ingest.source import Source, load_source, load_toml
 
+_LOWEST_M, _HIGHEST_M = -12_000.0, 100_000.0
+"""From the deepest sea to where a map of one survey's plane ends to be one of the round Earth."""
+
 
 class ProductTable(Params):
     """[product]: the name and version of the release."""
 
-    name: str = quantity("1", pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$", doc="Name of the product.")
-    version: str = quantity(
-        "1", pattern=r"^(0|[1-9]\d*)\.(0|[1-9]\d*)\.(0|[1-9]\d*)$", doc="Version, as 1.0.0."
+    name: str = quantity(
+        "1", pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$", doc="Name of the product, in lower case."
     )
+    version: str = quantity(
+        "1", pattern=r"^(0|[1-9]\d*)\.(0|[1-9]\d*)\.(0|[1-9]\d*)$", doc="Version, such as 1.0.0."
+    )
+
+
+def _south_north(limits: tuple[float, float]) -> tuple[float, float]:
+    if not -90.0 <= limits[0] < limits[1] <= 90.0:
+        raise ValueError("south, then north, within -90 to 90")
+    return limits
+
+
+def _west_east(limits: tuple[float, float]) -> tuple[float, float]:
+    if not all(-180.0 <= limit <= 360.0 for limit in limits) or limits[0] == limits[1]:
+        raise ValueError("west, then east, within -180 to 360")
+    return limits
 
 
 class RegionTable(Params):
     """region: limits of the release, WGS84 degrees."""
 
-    latitude: tuple[float, float] = quantity("degrees_north", doc="South and north limits.")
-    longitude: tuple[float, float] = quantity(
+    latitude: Annotated[tuple[float, float], pydantic.AfterValidator(_south_north)] = quantity(
+        "degrees_north", doc="South and north limits."
+    )
+    longitude: Annotated[tuple[float, float], pydantic.AfterValidator(_west_east)] = quantity(
         "degrees_east", doc="West and east limits; west > east crosses the date line."
     )
 
@@ -37,6 +56,8 @@ def _distinct(heights: tuple[float, ...]) -> tuple[float, ...]:
         raise ValueError("at least one height")
     if len(set(heights)) < len(heights):
         raise ValueError("each height once")
+    if not all(_LOWEST_M <= height <= _HIGHEST_M for height in heights):
+        raise ValueError(f"metres, within {_LOWEST_M:g} to {_HIGHEST_M:g}")
     return heights
 
 

@@ -58,21 +58,21 @@ def _load(path: Path) -> xr.Dataset:
             if dataset.nbytes > _DEFLATE_LIMIT * size:
                 raise FormatError(
                     f"declares {dataset.nbytes} bytes of arrays in a file of {size}",
-                    where=path.name,
+                    where=path,
                     remedy="fetch it again",
                 )
             return dataset.load()
     except (OSError, RuntimeError, ValueError, TypeError, LookupError) as caught:
         raise FormatError(
             f"is not a whole netCDF file: {str(caught).replace(str(path), path.name)}",
-            where=path.name,
+            where=path,
             remedy="fetch it again",
         ) from None
 
 
 def _read(dataset: xr.Dataset, path: Path, params: IngestGridParams) -> RawGrid:
     name = _choose_variable(dataset, path, params)
-    where = f"{path.name} variable '{name}'"
+    where = f"{path} variable '{name}'"
     variable = dataset[name]
     y_dim, x_dim = _axes(dataset, variable, where)
     flat = variable.squeeze([d for d in variable.dims if d not in (y_dim, x_dim)], drop=True)
@@ -100,7 +100,7 @@ def _choose_variable(dataset: xr.Dataset, path: Path, params: IngestGridParams) 
         if params.variable not in grids:
             raise SourceError(
                 f"no two-dimensional variable '{params.variable}'",
-                where=f"{path.name} key 'variable'",
+                where=f"{path} key 'variable'",
                 expected=f"one of {', '.join(grids) or 'none'}",
             )
         return params.variable
@@ -111,7 +111,7 @@ def _choose_variable(dataset: xr.Dataset, path: Path, params: IngestGridParams) 
     if len(found) != 1:
         raise SourceError(
             f"{len(found)} variables could be the anomaly: {', '.join(found) or 'none'}",
-            where=path.name,
+            where=path,
             expected="one two-dimensional variable with a magnetic unit such as nT",
             remedy=f"choose one with the key 'variable' (grids: {', '.join(grids) or 'none'})",
         )

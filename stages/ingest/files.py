@@ -33,7 +33,7 @@ def sniff(path: Path) -> str:
     Raises FormatError for a missing, empty or unreadable file, a folder, and other formats.
     """
     if path.is_dir():
-        raise FormatError("is a folder", where=path.name, expected="a grid file")
+        raise FormatError("is a folder", where=path, expected="a grid file")
     try:
         with path.open("rb") as file:
             head = file.read(_HEAD_BYTES)
@@ -42,9 +42,9 @@ def sniff(path: Path) -> str:
             "the file does not exist", where=path, remedy="fetch it or correct the path"
         ) from None
     except OSError as caught:
-        raise FormatError(f"cannot be read: {caught.strerror}", where=path.name) from None
+        raise FormatError(f"cannot be read: {caught.strerror}", where=path) from None
     if not head:
-        raise FormatError("the file is empty", where=path.name, remedy="fetch it again")
+        raise FormatError("the file is empty", where=path, remedy="fetch it again")
     for magic, kind in _MAGIC.items():
         if head.startswith(magic):
             return kind
@@ -54,7 +54,7 @@ def sniff(path: Path) -> str:
         return "gxf"
     raise FormatError(
         f"is {_describe(head)}",
-        where=f"{path.name} byte 0",
+        where=f"{path} byte 0",
         expected="GeoTIFF, GXF or netCDF",
         remedy="unpack or convert it first",
     )
@@ -72,7 +72,7 @@ def check_tiff_directories(path: Path) -> None:
     except (struct.error, OverflowError):
         raise FormatError(
             f"a TIFF directory points past the end of the file ({size} bytes)",
-            where=path.name,
+            where=path,
             remedy="the file is truncated: fetch it again",
         ) from None
 

@@ -35,7 +35,7 @@ def read_geotiff(path: Path, params: IngestGridParams) -> RawGrid:
         detail = caught.__cause__ or caught
         raise FormatError(
             f"is not a whole GeoTIFF: {str(detail).replace(str(path), path.name)}",
-            where=path.name,
+            where=path,
             remedy="fetch it again",
         ) from None
 
@@ -65,13 +65,11 @@ def _choose_band(dataset: Any, path: Path, band: int | None) -> int:
         )
         raise SourceError(
             f"the file has {dataset.count} bands ({names})",
-            where=path.name,
+            where=path,
             remedy="choose one with the key 'band'",
         )
     if band is not None and band > dataset.count:
-        raise SourceError(
-            f"key 'band' is {band}, but the file has {dataset.count}", where=path.name
-        )
+        raise SourceError(f"key 'band' is {band}, but the file has {dataset.count}", where=path)
     return band or 1
 
 
@@ -80,13 +78,13 @@ def _nodes(dataset: Any, path: Path) -> tuple[NDArray[np.float64], NDArray[np.fl
     if transform.is_identity:
         raise FormatError(
             "the raster has no position (geotransform)",
-            where=path.name,
+            where=path,
             expected="a GeoTIFF with a pixel scale and tie point",
         )
     if transform.b or transform.d:
         raise FormatError(
             f"the raster is rotated or sheared (b = {transform.b:g}, d = {transform.d:g})",
-            where=path.name,
+            where=path,
             expected="rows along x and columns along y",
             remedy="resample it to an unrotated grid of its projection",
         )

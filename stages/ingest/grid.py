@@ -63,10 +63,10 @@ def ingest_grid(files: Sequence[Path], *, params: IngestGridParams) -> xr.Datase
     IntegrityError : the file's digest is not the one its source states.
     """
     path, source = locate([Path(f) for f in files])
-    where = path.name if source is None else f"{source.path.name} [grid]"
+    where = str(path) if source is None else f"{source.path} [grid]"
     params = merge(params, source)
     raw = _READERS[sniff(path)](path, params)
-    refuse_infinite(raw.values, where=path.name)
+    refuse_infinite(raw.values, where=path)
     facts = _Facts(_settle(raw, params, path, where), where, path.name)
     grid = _oriented(raw, facts)
     return _dataset(grid, facts, _name(path, source))
@@ -187,7 +187,11 @@ def _settled_crs(raw: RawGrid, facts: _Facts) -> pyproj.CRS:
         try:
             given = coordinates.horizontal(pyproj.CRS.from_user_input(facts.params.crs))
         except CRSError as caught:
-            raise SourceError(f"key 'crs' is not a CRS: {caught}", where=facts.where) from None
+            raise SourceError(
+                f"key 'crs' is {facts.params.crs!r}, which PROJ does not know ({caught})",
+                where=facts.where,
+                expected="an EPSG code such as EPSG:32610, a PROJ string or WKT",
+            ) from None
     if raw.crs is None:
         if given is None:
             raise SourceError(

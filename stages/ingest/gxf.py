@@ -84,7 +84,7 @@ def _split(path: Path) -> tuple[dict[str, list[str]], str]:
             header[keyword].append(line.strip())
     raise FormatError(
         "the keyword #GRID is missing",
-        where=path.name,
+        where=path,
         remedy="the file is truncated or not GXF: fetch it again",
     )
 
@@ -95,16 +95,16 @@ def _number(
     if keyword not in header:
         if default is not None:
             return default
-        raise FormatError(f"the keyword #{keyword} is missing", where=path.name)
+        raise FormatError(f"the keyword #{keyword} is missing", where=path)
     try:
         value = float(header[keyword][0].split()[0])
     except (IndexError, ValueError):
         found = header[keyword][0] if header[keyword] else "nothing"
         raise FormatError(
-            f"#{keyword} is followed by '{found}'", where=path.name, expected="a number"
+            f"#{keyword} is followed by '{found}'", where=path, expected="a number"
         ) from None
     if not np.isfinite(value):
-        raise FormatError(f"#{keyword} is {value}", where=path.name, expected="a finite number")
+        raise FormatError(f"#{keyword} is {value}", where=path, expected="a finite number")
     return value
 
 
@@ -118,7 +118,7 @@ def _refuse_unusual(header: dict[str, list[str]], path: Path) -> None:
         value = _number(header, keyword, path, default=usual)
         if value != usual:
             raise FormatError(
-                f"#{keyword} is {value:g}", where=path.name, expected=f"{usual:g}", remedy=remedy
+                f"#{keyword} is {value:g}", where=path, expected=f"{usual:g}", remedy=remedy
             )
 
 
@@ -128,7 +128,7 @@ def _values(body: str, shape: tuple[int, int], path: Path) -> NDArray[np.float64
     if min(shape) < 1 or len(words) != expected:
         raise FormatError(
             f"{len(words)} values after #GRID",
-            where=path.name,
+            where=path,
             expected=f"#POINTS x #ROWS = {shape[1]} x {shape[0]} = {expected}",
             remedy="the file is truncated or damaged: fetch it again",
         )
@@ -138,7 +138,7 @@ def _values(body: str, shape: tuple[int, int], path: Path) -> NDArray[np.float64
         index = next(i for i, word in enumerate(words) if not _is_number(word))
         raise FormatError(
             f"value {index} after #GRID is '{words[index]}'",
-            where=f"{path.name} row {index // shape[1]}, point {index % shape[1]}",
+            where=f"{path} row {index // shape[1]}, point {index % shape[1]}",
             expected="a number",
         ) from None
 
@@ -158,7 +158,7 @@ def _transform(header: dict[str, list[str]], path: Path) -> tuple[float, float]:
         scale, offset = float(words[0]), float(words[1])
     except (IndexError, ValueError):
         raise FormatError(
-            f"#TRANSFORM is '{' '.join(words)}'", where=path.name, expected="scale and offset"
+            f"#TRANSFORM is '{' '.join(words)}'", where=path, expected="scale and offset"
         ) from None
     return scale, offset
 
@@ -168,7 +168,7 @@ def _axis(
 ) -> NDArray[np.float64]:
     step = _number(header, separation, path, default=1.0)
     if step <= 0:
-        raise FormatError(f"#{separation} is {step:g}", where=path.name, expected="above zero")
+        raise FormatError(f"#{separation} is {step:g}", where=path, expected="above zero")
     return _number(header, origin, path, default=0.0) + step * np.arange(count, dtype=np.float64)
 
 
@@ -199,7 +199,7 @@ def _usgs_crs(header: dict[str, list[str]], path: Path) -> pyproj.CRS | None:
     unit = " ".join(header.get("PRJUNIT", ["meters"])).lower()
     if unit not in _METRES:
         raise SourceError(
-            f"#PRJUNIT is '{unit}'", where=path.name, expected=f"one of {', '.join(_METRES)}"
+            f"#PRJUNIT is '{unit}'", where=path, expected=f"one of {', '.join(_METRES)}"
         )
     terms = {
         "a": "A_AXIS_RADIUS",

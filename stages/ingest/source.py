@@ -171,14 +171,14 @@ def locate(files: Sequence[Path]) -> tuple[Path, Source | None]:
     tomls = [p for p in files if p.suffix.lower() == ".toml"]
     given = {p.name: p for p in files if p.suffix.lower() != ".toml"}
     if len(tomls) > 1:
-        raise SourceError(f"{len(tomls)} source TOMLs", expected="one", where=tomls[1].name)
+        raise SourceError(f"{len(tomls)} source TOMLs", expected="one", where=tomls[1])
     source = load_source(tomls[0]) if tomls else None
     named = {p.name: p for p in source.files} if source else {}
     stray = sorted(set(given) - set(named)) if source else []
     if stray:
         raise SourceError(
             f"does not name the data file '{stray[0]}' given beside it",
-            where=f"{tomls[0].name} [source] files",
+            where=f"{tomls[0]} [source] files",
             expected=f"one of {', '.join(named)}",
         )
     data = named | given
@@ -207,7 +207,7 @@ def merge(params: IngestGridParams, source: Source | None) -> IngestGridParams:
         if stated.setdefault(key, value) != value:
             raise SourceError(
                 f"key '{key}' is {stated[key]!r}, but the parameter says {value!r}",
-                where=f"{source.path.name} [grid]",
+                where=f"{source.path} [grid]",
                 remedy="state it once",
             )
     return IngestGridParams(**stated)

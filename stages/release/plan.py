@@ -18,6 +18,9 @@ _TILE_SIZES_DEG = (0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
 _TILE_CELLS = 200
 """A default tile has at least so many cells a side: its halo then stays a quarter of it."""
 
+_MOST_NODES = 500_000_000
+"""A level's nine arrays of so many nodes are 18 GB: what asks for more is a slip of the unit."""
+
 
 def plan_lattice(bounds: Bounds, spacing_m: float, tile_deg: float | None = None) -> Lattice:
     """The lattice of nodes at most `spacing_m` apart that covers `bounds`.
@@ -25,7 +28,7 @@ def plan_lattice(bounds: Bounds, spacing_m: float, tile_deg: float | None = None
     Spacing is uniform in degrees, and such that `tile_deg` holds whole cells; tiles count from
     the south-west corner. East-west cells are sized where the region is widest.
     Raises CoverageError beyond 85 degrees, where north and east turn too fast for a spline,
-    ParameterError for a tile smaller than a few cells.
+    ParameterError for a tile smaller than a few cells and for too many nodes.
     """
     south, north, west, east = bounds
     if max(abs(south), abs(north)) > POLAR_LIMIT:
@@ -50,6 +53,14 @@ def plan_lattice(bounds: Bounds, spacing_m: float, tile_deg: float | None = None
             remedy="raise tile_deg or lower spacing_m",
         )
     step_lat, step_lon = tile_deg / cells[0], tile_deg / cells[1]
+    nodes = (north - south) / step_lat * (east - west) / step_lon
+    if nodes > _MOST_NODES:
+        raise ParameterError(
+            f"nodes {spacing_m:g} m apart are {nodes:.2g} a level",
+            where="anomaly.spacing_m",
+            expected=f"at most {_MOST_NODES:.0e}",
+            remedy="raise spacing_m, or set a smaller region",
+        )
     first_row, first_column = (
         math.floor(south / step_lat + 1e-9),
         math.floor(west / step_lon + 1e-9),
