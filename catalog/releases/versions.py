@@ -80,7 +80,13 @@ def _new_meaning(old: Manifest, new: Manifest) -> Iterable[str]:
     if old.has_reference_surface != new.has_reference_surface:
         yield "reference_surface_height came or went, and with it the meaning of height"
     if not _same_nodes(old.lattice, new.lattice):
-        yield f"the grid changed from {old.lattice} to {new.lattice}"
+        yield f"the grid changed from {_spell(old.lattice)} to {_spell(new.lattice)}"
+
+
+def _spell(lattice: Lattice) -> str:
+    spacing = f"{lattice.latitude_spacing:.9g} x {lattice.longitude_spacing:.9g} degrees"
+    corner = f"latitude {lattice.south:.9g}, longitude {lattice.west:.9g}"
+    return f"{lattice.rows} x {lattice.columns} cells of {spacing} from {corner}"
 
 
 def _same_nodes(a: Lattice, b: Lattice) -> bool:
@@ -102,7 +108,7 @@ def _new_values(old: Manifest, new: Manifest) -> Iterable[str]:
     if old.heights_m != new.heights_m:
         yield f"heights_m changed from {list(old.heights_m)} to {list(new.heights_m)}"
     if old.lattice != new.lattice:
-        yield f"the coverage changed from {old.lattice} to {new.lattice}"
+        yield f"the coverage changed from {_spell(old.lattice)} to {_spell(new.lattice)}"
     for place in sorted(set(old.tiles) & set(new.tiles)):
         if old.tiles[place].array_digest != new.tiles[place].array_digest:
             yield f"arrays changed in {new.tiles[place].path}"

@@ -28,16 +28,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print what the manifest says; the files themselves are `validate`'s business."""
-    from magtiles.catalog.releases.manifest import read_manifest
+    """Print what the manifest says, once every file is found to be what it lists."""
+    from magtiles.catalog import open_release
 
-    manifest = read_manifest(arguments.release)
-    described = describe(manifest)
+    release = open_release(arguments.release)
+    for file in release.manifest.files:
+        release.file(file.path)
+    described = describe(release.manifest)
     if arguments.json:
         print_json(described)
     else:
         _print_described(described)
-        _print_next(manifest, arguments.release)
+        _print_next(release.manifest, arguments.release)
     return 0
 
 
