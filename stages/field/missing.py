@@ -195,6 +195,8 @@ def _amplitude(values: Real, gaps: Mask, inversion: Inversion, noise: float) -> 
     total = np.bincount(which, counts)
     used = np.flatnonzero(total)
     power = np.bincount(which, periodogram.ravel() * counts)[used] / total[used]
+    if power.max() == 0.0:
+        return np.zeros(w.k.shape)
     power = np.maximum(power - noise, 1e-9 * power.max())
     smooth = np.exp(
         np.interp(np.log(np.maximum(w.k, lowest)), np.log(used * lowest), np.log(power))
@@ -205,8 +207,6 @@ def _amplitude(values: Real, gaps: Mask, inversion: Inversion, noise: float) -> 
     fy, fx, fd = inversion.direction
     projection = fd**2 + (fy**2 + fx**2) / 2
     k = np.where(w.k == 0.0, np.inf, w.k)
-    if variance == 0.0:
-        return np.zeros_like(k)
     return np.asarray(np.sqrt(smooth * signal / variance / projection) / k)
 
 
