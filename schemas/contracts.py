@@ -83,6 +83,9 @@ def check_document(document: dict[str, Any], contract: str, *, where: object = N
         raise _breach(problems[0], document, resolve(contract), where)
 
 
+_BOUNDS = {"minimum": "at least", "exclusiveMinimum": "more than", "maximum": "at most"}
+
+
 def _breach(
     problem: jsonschema.ValidationError, document: dict[str, Any], contract: str, where: object
 ) -> ContractError:
@@ -93,10 +96,15 @@ def _breach(
         missing = [k for k in problem.validator_value if k not in problem.instance]
         what = f"'{missing[0]}' is missing"
         expected = f"all of {', '.join(problem.validator_value)}"
-    elif problem.validator in ("const", "enum"):
+    elif problem.validator == "const":
         what, expected = f"found {problem.instance!r}", f"{problem.validator_value!r}"
+    elif problem.validator == "enum":
+        what = f"found {problem.instance!r}"
+        expected = " or ".join(repr(value) for value in problem.validator_value)
     elif problem.validator == "anyOf" and path.endswith(("minimum", "maximum")):
-        what, expected = f"found {problem.instance}", json.dumps(problem.validator_value[-1])
+        bounds = problem.validator_value[-1].items()
+        what = f"found {problem.instance:g}"
+        expected = " and ".join(f"{_BOUNDS[name]} {bound:g}" for name, bound in bounds)
     elif problem.validator == "anyOf" and not path:
         what, expected = f"dims are {document.get('dims')}", "(y, x) or (latitude, longitude)"
     return ContractError(what, where=place, expected=expected, remedy=f"see contract {contract}")
