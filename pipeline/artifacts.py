@@ -26,7 +26,7 @@ def write_artifact(dataset: xr.Dataset, path: Path, contract: str) -> None:
     """
     try:
         if contract.startswith("anomaly-tile/"):
-            write_tile(dataset, path)
+            write_tile(dataset, path, checked=True)
         else:
             _write_plain(dataset, path, contract)
     except (OSError, RuntimeError) as caught:  # netCDF4 says RuntimeError for a full disk

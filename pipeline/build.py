@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import concurrent.futures
 import contextlib
 import logging
-import multiprocessing
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,26 +16,26 @@ from magtiles.catalog.kernels.bspline import HALO
 from magtiles.catalog.releases.lattice import Lattice
 from magtiles.pipeline import receipts
 from magtiles.pipeline.artifacts import open_artifact
+from magtiles.pipeline.cutting import cut_all
 from magtiles.pipeline.preview import write_preview
 from magtiles.pipeline.product import Product, load_product
 from magtiles.pipeline.progress import Progress, silent
 from magtiles.pipeline.runner import StageResult, run_stage
-from magtiles.schemas.errors import CoverageError, ParameterError
+from magtiles.schemas.errors import CoverageError, MagtilesError, ParameterError
 from magtiles.stages.declare import Stage
 from magtiles.stages.field import components, crop, voids
 from magtiles.stages.field.direction import reference_coefficients
 from magtiles.stages.field.extent import data_bounds
 from magtiles.stages.field.geometry import true_spacing
 from magtiles.stages.ingest import grid as ingest
-from magtiles.stages.release import tiles
 from magtiles.stages.release.plan import Bounds, plan_lattice
 from magtiles.stages.release.publish import PublishResult, publish_release
+from magtiles.stages.release.records import MeasuredTile
 
 _log = logging.getLogger(__name__)
 
 _MARGIN_HEIGHTS = 20.0
 _MARGIN_CELLS = 64
-_PROCESSES = 2
 
 
 @dataclass(frozen=True)
@@ -71,8 +69,22 @@ def build_product(
     Raises MagtilesError subclasses for bad sources, data, parameters and versions.
     """
     wanted = load_product(product)
+    for folder in (store, work):
+        _check_writable(folder)
     with _asked_by(product):
         return _build(wanted, store, work, data, progress)
+
+
+def _check_writable(folder: Path) -> None:
+    """Raise MagtilesError, before the work and not after it, where nothing can be written."""
+    above = next(p for p in (folder.absolute(), *folder.absolute().parents) if p.exists())
+    if not (above.is_dir() and os.access(above, os.W_OK | os.X_OK)):
+        raise MagtilesError(
+            "cannot be written to" if above.is_dir() else f"{above} is no folder",
+            where=folder,
+            expected="a folder, or a place to make one",
+            remedy="choose another, or change its permissions",
+        )
 
 
 @contextlib.contextmanager
@@ -97,7 +109,7 @@ def _build(
     spacing = wanted.anomaly.spacing_m or _default_spacing(survey, heights)
     lattice = plan_lattice(survey.bounds, spacing, wanted.anomaly.tile_deg)
     levels = [_level(wanted, survey, lattice, h, folder, steps) for h in heights]
-    cut = _cut(lattice, levels, folder, progress)
+    cut = cut_all(lattice, levels, folder / "tiles", progress)
     return _publish(wanted, store, folder, data, cut, levels, steps)
 
 
@@ -173,42 +185,12 @@ def _level(
     return steps.run(components.STAGE, {"grid": survey.grid}, out, params)
 
 
-def _cut(lattice: Lattice, levels: Sequence[Path], folder: Path, progress: Progress) -> list[Path]:
-    """All tiles, cut in a few processes: netCDF compresses on one thread a process."""
-    rows, columns = lattice.shape
-    jobs = [
-        (levels, folder / "tiles" / f"r{r:03d}c{c:03d}.nc", tiles.tile_params(lattice, r, c))
-        for r in range(rows)
-        for c in range(columns)
-    ]
-    done: list[Path] = []
-    for out in _in_processes(jobs):
-        done.append(out)
-        progress("cutting tiles", len(done), len(jobs))
-    return done
-
-
-def _in_processes(jobs: Sequence[tuple[Any, ...]]) -> Iterator[Path]:
-    processes = min(_PROCESSES, os.cpu_count() or 1, len(jobs))
-    if processes < 2:
-        yield from (_cut_one(*job) for job in jobs)
-        return
-    # Spawned, not forked: the threads of FFT and numba do not survive a fork.
-    context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(processes, mp_context=context) as pool:
-        yield from pool.map(_cut_one, *zip(*jobs, strict=True))
-
-
-def _cut_one(levels: Sequence[Path], out: Path, params: Mapping[str, Any]) -> Path:
-    return run_stage(tiles.STAGE, {"grid": levels}, out, params).out
-
-
 def _publish(
     wanted: Product,
     store: Path,
     folder: Path,
     data: Path | None,
-    cut: Sequence[Path],
+    cut: Sequence[MeasuredTile],
     levels: Sequence[Path],
     steps: _Steps,
 ) -> PublishResult:
@@ -246,10 +228,12 @@ def _publish(
 
 def _provenance(wanted: Product, folder: Path, levels: Sequence[Path]) -> dict[str, Any]:
     """How the release was made: every artifact with its stage, parameters and inputs."""
-    made = [folder / name for name in ("survey.nc", "cropped.nc", "filled.nc")]
+    names = ["survey.nc", "filled.nc"]
+    if wanted.anomaly.region is not None:
+        names.insert(1, "cropped.nc")
     steps = []
-    for artifact in [*made, *levels]:
-        if (receipt := receipts.read_receipt(artifact)) is not None and artifact.exists():
+    for artifact in [*(folder / name for name in names), *levels]:
+        if (receipt := receipts.read_receipt(artifact)) is not None:
             kept = {k: receipt[k] for k in ("stage", "version", "params", "inputs")}
             steps.append({"artifact": artifact.name, **kept})
     return {

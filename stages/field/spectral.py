@@ -32,7 +32,12 @@ LOW_INCLINATION_SINE = np.sin(np.radians(20.0))
 _DAMPING = 0.1
 _PASS = 0.75
 
-_WORKERS = -1
+_MANY = 1 << 18
+
+
+def _workers(size: int) -> int:
+    """Threads for a transform of so many numbers: starting them for a small one costs more."""
+    return -1 if size > _MANY else 1
 
 
 @dataclass(frozen=True)
@@ -148,13 +153,14 @@ class Inversion:
 
 def forward(values: Real, shape: tuple[int, int] | None = None) -> Complex:
     """Real two-dimensional transform, of `values` extended by zeros to `shape`."""
-    return np.asarray(scipy.fft.rfft2(values, s=shape, workers=_WORKERS))
+    return np.asarray(scipy.fft.rfft2(values, s=shape, workers=_workers(values.size)))
 
 
 def inverse(spectrum: Complex, shape: tuple[int, int], rows: slice, columns: slice) -> Real:
     """The inverse transform, computed only for `rows`, returned for `columns`. Overwrites input."""
-    partial = scipy.fft.ifft(spectrum, axis=0, overwrite_x=True, workers=_WORKERS)[rows]
-    values = scipy.fft.irfft(partial, n=shape[1], axis=1, workers=_WORKERS)
+    workers = _workers(spectrum.size)
+    partial = scipy.fft.ifft(spectrum, axis=0, overwrite_x=True, workers=workers)[rows]
+    values = scipy.fft.irfft(partial, n=shape[1], axis=1, workers=workers)
     return np.asarray(values[:, columns])
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 import xarray as xr
+from numba import njit
 from numpy.typing import NDArray
 
 from magtiles.stages.field.interpolate import evaluate_linear
@@ -79,16 +80,45 @@ def faded_power(
 
 def _group_means(field: AnomalousField, total_power: Real) -> dict[str, float]:
     """Mean variance of each group's components, from the spectral power of the total."""
-    w = field.wavenumbers
+    w, inversion = field.wavenumbers, field.inversion
+    sums = group_sums(
+        total_power, w.y[:, 0], w.x[0], w.multiplicity[0], inversion.direction, inversion.damping
+    )
     count = w.shape[0] * w.shape[1]
-    total = total_power * w.multiplicity
-    potential = np.abs(field.inversion.potential) ** 2 * total
-    y2, x2, k2 = w.y**2, w.x**2, w.k**2
     return {
-        "total": float(total.sum()) / count,
-        "vector": float((potential * k2).sum()) * 2 / len(VECTOR) / count,
-        "tensor": float((potential * (2 * k2**2 - y2 * x2)).sum()) * _PER_KM2 / len(TENSOR) / count,
+        "total": sums[0] / count,
+        "vector": sums[1] / len(VECTOR) / count,
+        "tensor": sums[2] * _PER_KM2 / len(TENSOR) / count,
     }
+
+
+@njit(cache=True, nogil=True)
+def group_sums(
+    total_power: Real,
+    ky: Real,
+    kx: Real,
+    multiplicity: Real,
+    direction: tuple[float, float, float],
+    damping: float,
+) -> tuple[float, float, float]:
+    """Sum of power of the total, of the vector's components and of the tensor's five (per m^2).
+
+    With p the potential's power the vector's is 2 k^2 p, the tensor's (2 k^4 - ky^2 kx^2) p.
+    """
+    fy, fx, fd = direction
+    total = vector = tensor = 0.0
+    for i in range(ky.size):
+        for j in range(kx.size):
+            power = total_power[i, j] * multiplicity[j]
+            total += power
+            y2, x2 = ky[i] * ky[i], kx[j] * kx[j]
+            k2 = y2 + x2
+            if k2 > 0.0:
+                projected = k2 * fd * fd + (ky[i] * fy + kx[j] * fx) ** 2
+                potential = power * projected / (projected + damping * damping * k2) ** 2
+                vector += 2.0 * k2 * potential
+                tensor += (2.0 * k2 * k2 - y2 * x2) * potential
+    return total, vector, tensor
 
 
 def alias_gain(grid: xr.Dataset, inversion: Inversion, height_gain: float) -> dict[str, float]:

@@ -15,8 +15,8 @@ Bounds = tuple[float, float, float, float]
 
 POLAR_LIMIT = 85.0
 _TILE_SIZES_DEG = (0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
-_TILE_CELLS = 200
-"""A default tile has at least so many cells a side: its halo then stays a quarter of it."""
+_TILE_CELLS = 300
+"""A default tile has at least so many cells a side: its halo adds a sixth at most."""
 
 _MOST_NODES = 500_000_000
 """A level's nine arrays of so many nodes are 18 GB: what asks for more is a slip of the unit."""

@@ -66,7 +66,7 @@ def publish_release(
     *,
     product: str,
     version: str,
-    tiles: Sequence[Path],
+    tiles: Sequence[Path | MeasuredTile],
     identity: Mapping[str, Any],
     inputs: Sequence[Mapping[str, Any]],
     provenance: Mapping[str, Any],
@@ -76,7 +76,8 @@ def publish_release(
 
     Parameters
     ----------
-    tiles : files of contract anomaly-tile/1 that cover a lattice whole; they are copied.
+    tiles : files of contract anomaly-tile/1 that cover a lattice whole, or what `measure_tile`
+        found of them; they are copied.
     identity : what the release is, beyond the tiles' reference field, epoch and definition;
         a value that contradicts the tiles raises ContractError.
     inputs : the sources, each with the keys id, sha256, licence and role.
@@ -98,7 +99,8 @@ def publish_release(
     home = store / product
     home.mkdir(parents=True, exist_ok=True)
     _remove_dead_staging(home)
-    measured = sorted((measure_tile(p) for p in tiles), key=lambda t: str(t.entry["path"]))
+    measured = [measure_tile(t) if isinstance(t, Path) else t for t in tiles]
+    measured.sort(key=lambda t: str(t.entry["path"]))
     document = _document(product, version, measured, identity, inputs)
     extras = {path: _extra(path, file) for path, file in sorted(extra_files.items())}
     files = {PROVENANCE_NAME: canonical_json(provenance), **extras}
