@@ -79,7 +79,7 @@ class AnomalyTable(Params):
         doc="Node spacing; default the smaller of the source's cell and half the lowest gain.",
     )
     tile_deg: float | None = quantity(
-        "degree", default=None, gt=0, le=90, doc="Size of a tile; default some 200-500 cells."
+        "degree", default=None, gt=0, le=90, doc="Size of a tile; default some 300 cells or more."
     )
     inclination_deg: float | None = quantity(
         "degree",

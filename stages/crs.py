@@ -63,10 +63,19 @@ def to_wgs84(
             f"how the datum '{datum}' relates to WGS84 is not known",
             where=f"crs '{crs.name}'",
             expected="a CRS whose datum is stated",
-            remedy="state it in [grid] crs (such as '+datum=NAD27'), or accept an error of up "
-            "to some 200 m with allow_ballpark_datum = true",
+            remedy=f"state the whole CRS with its datum, as in crs = '{_with_datum(crs)}' under "
+            "[grid], or accept an error of up to some 200 m with allow_ballpark_datum = true",
         )
     return group.transformers[0]
+
+
+def _with_datum(crs: pyproj.CRS) -> str:
+    """A CRS as a PROJ string with a datum, as an example, in place of its bare ellipsoid."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # a PROJ string holds less than WKT
+        words = crs.to_proj4().split()
+    dropped = ("+ellps=", "+a=", "+b=", "+rf=", "+R=", "+no_defs", "+type=")
+    return " ".join([*(w for w in words if not w.startswith(dropped)), "+datum=NAD27"])
 
 
 def datum_operation(transformer: pyproj.Transformer) -> DatumOperation:
