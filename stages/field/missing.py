@@ -125,7 +125,9 @@ class _Experiment:
         """Squared error of one random field by product group, mean over its components."""
         w = self.wavenumbers
         truth = forward(random.standard_normal(self.padding.shape)) * self.amplitude
-        observed = inverse(truth * self.inversion.theta, w.shape, *self.padding.interior)
+        observed = np.asarray(
+            inverse(truth * self.inversion.theta, w.shape, *self.padding.interior), dtype=float
+        )
         filled = extend(
             np.where(self.gaps, np.nan, observed), self.beyond, self.distance, self.taper_m
         )

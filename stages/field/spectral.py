@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.fft
@@ -156,8 +157,16 @@ def forward(values: Real, shape: tuple[int, int] | None = None) -> Complex:
     return np.asarray(scipy.fft.rfft2(values, s=shape, workers=_workers(values.size)))
 
 
-def inverse(spectrum: Complex, shape: tuple[int, int], rows: slice, columns: slice) -> Real:
-    """The inverse transform, computed only for `rows`, returned for `columns`. Overwrites input."""
+def inverse(
+    spectrum: NDArray[np.complexfloating[Any, Any]],
+    shape: tuple[int, int],
+    rows: slice,
+    columns: slice,
+) -> NDArray[np.floating[Any]]:
+    """The inverse transform, computed only for `rows`, returned for `columns`.
+
+    In the spectrum's own precision; overwrites it.
+    """
     workers = _workers(spectrum.size)
     partial = scipy.fft.ifft(spectrum, axis=0, overwrite_x=True, workers=workers)[rows]
     values = scipy.fft.irfft(partial, n=shape[1], axis=1, workers=workers)
