@@ -47,8 +47,10 @@ def from_angles(inclination_deg: float, declination_deg: float, shape: tuple[int
 def reference_coefficients(reference_field: str) -> Path | None:
     """The coefficient file of an IGRF generation that ppigrf carries; None for any other field."""
     generation = reference_field.upper().replace("-", "").replace(" ", "")
+    if re.fullmatch(r"IGRF\d+", generation) is None:
+        return None
     file = Path(ppigrf.__file__).with_name(f"{generation}.shc")
-    return file if re.fullmatch(r"IGRF\d+", generation) and file.is_file() else None
+    return file if file.is_file() else None
 
 
 def igrf_direction(
