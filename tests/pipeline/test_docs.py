@@ -1,0 +1,134 @@
+"""README and docs hold: their Python runs, their commands parse, their tables are the models'."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from magtiles.catalog.flags import QualityFlag
+from magtiles.catalog.releases.tile_table import TILE_VARIABLES
+from magtiles.pipeline import main as command_line
+from magtiles.pipeline.main import main
+from magtiles.pipeline.product import AnomalyTable, ProductTable, ProductTables, RegionTable
+from magtiles.pipeline.sample import DEMO, synthesize, write_survey
+from magtiles.schemas import contracts
+from magtiles.stages.declare import Params, parse_params
+from magtiles.stages.ingest.source import IngestGridParams, SourceParams, load_source
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+TABLES = {
+    "[source]": SourceParams,
+    "[grid]": IngestGridParams,
+    "[product]": ProductTable,
+    "[anomaly]": AnomalyTable,
+    "region": RegionTable,
+}
+
+
+def blocks(language: str) -> list[object]:
+    parameters = []
+    for page in PAGES:
+        found = re.findall(rf"^```{language}\n(.*?)^```", page.read_text("utf-8"), re.M | re.S)
+        if found:
+            parameters.append(pytest.param(page, found, id=str(page.relative_to(ROOT))))
+    return parameters
+
+
+@pytest.fixture(scope="module")
+def beside_the_demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that holds a small stand-in for what `make` builds."""
+    folder = tmp_path_factory.mktemp("checkout")
+    spec = replace(DEMO, width_m=50e3, length_m=40e3, dipoles=60)
+    write_survey(folder / "build/sample", synthesize(spec))
+    product, store, work = (
+        str(folder / f"build/{n}") for n in ("sample/demo.toml", "releases", "w")
+    )
+    assert main(["build", product, "--store", store, "--work", work]) == 0
+    return folder
+
+
+@pytest.mark.parametrize(("page", "found"), blocks("python"))
+def test_python_examples_run_in_order(
+    page: Path, found: list[str], beside_the_demo: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(beside_the_demo)
+    names: dict[str, object] = {}
+    for block in found:
+        if "STAGE = Stage(" in block:  # how to write a stage: imports are left out there
+            continue
+        exec(compile(block, str(page), "exec"), names)
+
+
+@pytest.mark.parametrize(("page", "found"), blocks("console"))
+def test_commands_in_examples_exist(page: Path, found: list[str]) -> None:
+    commands = re.findall(r"^\$ (?:\S*/)?magtiles (.*?)(?:\s+#.*)?$", "".join(found), re.M)
+    targets = re.findall(r"^\$ make(?: -\S+)* ([a-z-]+)", "".join(found), re.M)
+    parser = command_line._parser()
+    for words in commands:
+        parser.parse_args(words.replace("'", "").split())
+    makefile = (ROOT / "Makefile").read_text("utf-8")
+    for target in targets:
+        assert re.search(rf"^{target}:", makefile, re.M), target
+
+
+@pytest.mark.parametrize(("page", "found"), blocks("toml"))
+def test_toml_examples_are_valid(page: Path, found: list[str], tmp_path: Path) -> None:
+    for block in found:
+        tables = tomllib.loads(block)
+        if "source" in tables:
+            (tmp_path / "source.toml").write_text(block)
+            assert load_source(tmp_path / "source.toml").source.licence
+        else:
+            assert parse_params(ProductTables, tables, where=page).anomaly.heights_m
+
+
+def table_of(kind: type[Params]) -> str:
+    """A Markdown table of the keys of a table, from its model."""
+    lines = ["| key | unit | default | meaning |", "|---|---|---|---|"]
+    for name, field in kind.model_fields.items():
+        extra = field.json_schema_extra
+        unit = str(extra["unit"]) if isinstance(extra, dict) else "1"
+        unit = "" if unit == "1" else unit
+        default = "required" if field.is_required() else ""
+        if field.default is False:
+            default = "`false`"
+        meaning = str(field.description).replace("|", r"\|")
+        lines.append(f"| `{name}` | {unit} | {default} | {meaning} |")
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_tables_of_keys_are_those_of_the_models(name: str) -> None:
+    page = (ROOT / "docs/toml.md").read_text("utf-8")
+    assert table_of(TABLES[name]) in page
+
+
+def test_format_names_every_variable_flag_and_contract() -> None:
+    page = (ROOT / "docs/format.md").read_text("utf-8")
+    for name, rule in TILE_VARIABLES.items():
+        row = next(line for line in page.splitlines() if line.startswith(f"| `{name}`"))
+        assert rule.dtype in row
+        assert (rule.units or "-") in row
+        assert ("(" + ", ".join(rule.dims) + ")" if rule.dims else "scalar") in row
+    for flag in QualityFlag:
+        assert f"| {flag.value} | `{str(flag.name).lower()}` |" in page
+    for name, versions in contracts.available().items():
+        assert f"`{name}/{versions[-1]}`" in page
+
+
+def test_make_help_and_readme_agree() -> None:
+    targets = re.findall(r"^([a-z-]+):.*?## ", (ROOT / "Makefile").read_text("utf-8"), re.M)
+    page = (ROOT / "docs/developing.md").read_text("utf-8")
+    for target in targets:
+        assert f"make {target}" in page, target
+
+
+def test_links_lead_somewhere() -> None:
+    for page in PAGES:
+        for link in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text("utf-8")):
+            assert (page.parent / link).exists(), f"{page.name}: {link}"
