@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _DPI = 140
-_MAX_NODES = 1600
+_MAX_NODES = 900
 """Nodes along an axis that a picture can show; more are thinned."""
 _SMOOTH_BELOW = 700
 """Nodes below which a picture would show single cells, and is interpolated instead."""

@@ -172,7 +172,7 @@ def _assemble(
         for name, values in zip(PRODUCTS, products, strict=True)
     }
     for name, group in SIGMAS.items():
-        variables[name] = field(sigmas[group], "nT km-1" if group == "tensor" else "nT")
+        variables[name] = field(_rounded(sigmas[group]), "nT km-1" if group == "tensor" else "nT")
     for axis, values in zip(("north", "east", "down"), nodes.ambient, strict=True):
         variables[f"ambient_{axis}"] = field(values, "1")
     variables["quality_flag"] = (dims, flags, flag_attributes() | {"grid_mapping": "crs"})
@@ -189,6 +189,12 @@ def _assemble(
     attributes["ambient_inclination_deg"] = float(middle.inclination_deg)
     attributes["ambient_declination_deg"] = float(middle.declination_deg)
     return xr.Dataset(variables, coords=coordinates, attrs=attributes)
+
+
+def _rounded(sigma: NDArray[np.float64]) -> Single:
+    """Sigma to three digits (eleven bits): more would say nothing, and not compress."""
+    bits = sigma.astype(np.float32).view(np.uint32)
+    return ((bits + np.uint32(1 << 12)) & np.uint32(0xFFFFE000)).view(np.float32)
 
 
 STAGE = Stage(

@@ -61,11 +61,18 @@ class PlaneMap:
 
     def distance(self, gaps: Mask, outside: bool) -> Real:
         """True distance (m) of each node to the nearest of `gaps` (or the array's outside)."""
+        if not gaps.any():
+            return self._distance_to_outside() if outside else np.full(gaps.shape, np.inf)
         ringed = np.pad(gaps, 1, constant_values=outside)
-        if not ringed.any():
-            return np.full(gaps.shape, np.inf)
         found = ndimage.distance_transform_edt(~ringed, sampling=self.spacing)
         return np.asarray(found[1:-1, 1:-1])
+
+    def _distance_to_outside(self) -> Real:
+        """The same where the nearest gap is the array's outside, from its border one node on."""
+        rows, columns = (
+            np.minimum(np.arange(n), np.arange(n)[::-1]) + 1.0 for n in self.values.shape
+        )
+        return np.minimum.outer(rows * self.spacing[0], columns * self.spacing[1])
 
 
 def prepare(grid: xr.Dataset) -> PlaneMap:

@@ -7,6 +7,7 @@ millionth of the field, is far below any survey's noise, and they take half the 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -62,7 +63,9 @@ class Level:
         w = self.inversion.wavenumbers
         scale = _METRES_PER_KM if len(product) == 2 else 1.0
         axes = np.array([_AXES[axis] for axis in product])
-        differentiate(self._potential, (w.y[:, 0], w.x[0]), axes, scale, rows, out)
+        _kernel(_DIFFERENTIATE, ny * nk)(
+            self._potential, (w.y[:, 0], w.x[0]), axes, scale, rows, out
+        )
         if len(product) == 1:
             out[0, 0] = self._total[0, 0] * self.inversion.mean_vector[_AXES[product]]
         return out
@@ -78,7 +81,7 @@ class Level:
     def _lifted(self, *, potential: bool) -> SingleComplex:
         w = self.inversion.wavenumbers
         out = np.empty(self.surface.shape, np.complex64)
-        lift(
+        _kernel(_LIFT, self.surface.size)(
             self.surface,
             (w.y[:, 0], w.x[0]),
             self._weights(),
@@ -110,7 +113,6 @@ def _rows(count: int, dense: int) -> NDArray[np.int64]:
     return rows
 
 
-@njit(parallel=True, cache=True, nogil=True)
 def lift(
     surface: Complex,
     k: tuple[Real, Real],
@@ -144,7 +146,6 @@ def lift(
             out[i, j] = value
 
 
-@njit(parallel=True, cache=True, nogil=True)
 def differentiate(
     potential: SingleComplex,
     k: tuple[Real, Real],
@@ -173,3 +174,23 @@ def differentiate(
                     factor *= math.sqrt(ky * ky + kx * kx)
             value = potential[i, j] * np.float32(factor)
             out[rows[i], j] = complex(-value.imag, value.real) if turns == 1 else value
+
+
+_Kernel = Callable[..., None]
+_MANY = 1 << 17
+
+
+def _compiled(function: _Kernel) -> tuple[_Kernel, _Kernel]:
+    """A kernel for one thread and one for all."""
+    return (
+        njit(cache=True, nogil=True)(function),
+        njit(parallel=True, cache=True, nogil=True)(function),
+    )
+
+
+_LIFT, _DIFFERENTIATE = _compiled(lift), _compiled(differentiate)
+
+
+def _kernel(versions: tuple[_Kernel, _Kernel], size: int) -> _Kernel:
+    """All threads for large arrays; to wake them for a small one takes longer than its work."""
+    return versions[size > _MANY]
