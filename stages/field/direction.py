@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import logging
 import re
 from pathlib import Path
 from typing import NamedTuple
@@ -17,6 +18,8 @@ from magtiles.schemas.errors import CoverageError, ParameterError
 Real = NDArray[np.float64]
 
 _METRES_PER_KM = 1000.0
+
+_log = logging.getLogger(__name__)
 
 
 class Ambient(NamedTuple):
@@ -108,6 +111,12 @@ class AmbientSource:
         self._coefficients = reference_coefficients(str(grid.attrs["reference_field"]))
         if inclination_deg is None:
             _check_epoch(self._date, self._coefficients)
+            if self._coefficients is None:
+                _log.warning(
+                    "no coefficients of reference field '%s' at hand: the ambient direction is "
+                    "the newest IGRF's",
+                    grid.attrs["reference_field"],
+                )
         self._height = float(np.mean(grid["height"].values))
 
     def at(self, latitude: Real, longitude: Real) -> Ambient:
