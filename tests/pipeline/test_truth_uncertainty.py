@@ -23,18 +23,11 @@ def demo(tmp_path_factory):
 
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
-@pytest.mark.parametrize("place", ["interior", "border"])
+@pytest.mark.parametrize("place", PLACES)
 def test_demo_as_the_reader_answers(demo, quantity, place):
     found = fractions(demo)
     for gain in GAINS:
         assert 0.5 < found[gain, quantity, place] < 0.9, gain
-
-
-@pytest.mark.parametrize("quantity", QUANTITIES)
-def test_demo_over_its_one_void(demo, quantity):
-    """All levels together: the same 108 nodes, and those around them higher up."""
-    inside, every = (sum(demo[g, quantity, "void"][i] for g in GAINS) for i in (0, 1))
-    assert 0.5 < inside / every < 0.9
 
 
 @pytest.fixture(scope="module")
