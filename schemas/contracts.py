@@ -133,6 +133,8 @@ def _describe_variable(variable: xr.Variable) -> dict[str, Any]:
         described["units"] = str(variable.attrs["units"])
     if variable.dtype.kind in "fiu":
         described |= _describe_values(variable.values)
+    elif variable.dtype.kind == "M":
+        described["finite"] = not bool(np.isnat(variable.values).any())
     return described
 
 

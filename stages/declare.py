@@ -8,9 +8,11 @@
 
 from __future__ import annotations
 
+import datetime
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, get_args
+from typing import Annotated, Any, get_args
 
 import pydantic
 import xarray as xr
@@ -22,6 +24,9 @@ from magtiles.schemas.errors import MagtilesError, ParameterError
 FILES = "files"
 """Input kind of an ingest stage: foreign files or source TOMLs, one or more."""
 
+OPTIONAL_FILE = "optional-file"
+"""Input kind of a foreign file that `run` takes as a path where it is given, none where not."""
+
 
 class Params(pydantic.BaseModel):
     """Base of every stage's parameters: frozen, strict, finite, no unknown keys."""
@@ -29,6 +34,25 @@ class Params(pydantic.BaseModel):
     model_config = pydantic.ConfigDict(
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False
     )
+
+
+def _iso_date(value: object) -> object:
+    # TOML has dates of its own; JSON and the command line have only text.
+    if isinstance(value, datetime.date) and not isinstance(value, datetime.datetime):
+        return value.isoformat()
+    if isinstance(value, str):
+        try:
+            if re.fullmatch(r"\d{4}-\d{2}-\d{2}", value):
+                datetime.date.fromisoformat(value)
+                return value
+        except ValueError:
+            pass
+        raise ValueError("an ISO date such as 1975-07-01")
+    return value
+
+
+IsoDate = Annotated[str, pydantic.BeforeValidator(_iso_date)]
+"""A parameter that is a date, kept as ISO text; TOML may write its own."""
 
 
 def quantity(unit: str, *, doc: str, default: Any = PydanticUndefined, **limits: Any) -> Any:
@@ -52,7 +76,8 @@ class Stage:
     name : the name on the command line and in receipts.
     version : raised whenever the same inputs would give other output.
     params : the class of its parameters.
-    inputs : role to contract; `Many(contract)` for several, `FILES` for foreign files.
+    inputs : role to contract; `Many(contract)` for several, `FILES` for foreign files,
+        `OPTIONAL_FILE` for one that may be left out. Stages of one name differ in their roles.
     output : contract of what `run` returns.
     run : called with one keyword per role and ``params``; does no I/O outside ``ingest``.
     """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import tomllib
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -46,12 +47,11 @@ def run(arguments: argparse.Namespace) -> int:
     from magtiles.pipeline.runner import run_stage
     from magtiles.stages.declare import parse_params
 
-    stage = _find(arguments.stage)
+    inputs = _inputs(arguments.inputs)
+    stage = find_stage(arguments.stage, inputs)
     params = parse_assignments(arguments.params)
     parse_params(stage.params, params, where=f"stage {stage.name}", error=UsageError)
-    result = run_stage(
-        stage, _inputs(arguments.inputs), arguments.out, params, force=arguments.force
-    )
+    result = run_stage(stage, inputs, arguments.out, params, force=arguments.force)
     if arguments.json:
         print_json(result)
     else:
@@ -102,10 +102,15 @@ def _split(word: str, option: str, form: str) -> tuple[str, str]:
     return key.strip(), value
 
 
-def _find(name: str) -> Stage:
+def find_stage(name: str, roles: Collection[str]) -> Stage:
+    """The stage of a name; of several, the one that takes `roles`, else the first.
+
+    Raises UsageError for an unknown name.
+    """
     from magtiles.stages.registry import STAGES
 
-    by_name = {stage.name: stage for stage in STAGES}
-    if name not in by_name:
-        raise UsageError(f"no stage named '{name}'", expected=f"one of {', '.join(by_name)}")
-    return by_name[name]
+    named = [stage for stage in STAGES if stage.name == name]
+    if not named:
+        known = ", ".join(dict.fromkeys(stage.name for stage in STAGES))
+        raise UsageError(f"no stage named '{name}'", expected=f"one of {known}")
+    return next((stage for stage in named if stage.inputs.keys() >= set(roles)), named[0])

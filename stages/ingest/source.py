@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import datetime
 import hashlib
-import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,24 +12,9 @@ from typing import Annotated, Any, Literal
 import pydantic
 
 from magtiles.schemas.errors import IntegrityError, SourceError
-from magtiles.stages.declare import Params, parse_params, quantity
+from magtiles.stages.declare import IsoDate, Params, parse_params, quantity
 
 TOTAL_FIELD_ANOMALY = "total-field anomaly: |F| minus the reference field's magnitude"
-
-
-def _iso_date(value: object) -> object:
-    # TOML has dates of its own; JSON and the command line have only text.
-    if isinstance(value, datetime.date) and not isinstance(value, datetime.datetime):
-        return value.isoformat()
-    if isinstance(value, str):
-        try:
-            if re.fullmatch(r"\d{4}-\d{2}-\d{2}", value):
-                datetime.date.fromisoformat(value)
-                return value
-        except ValueError:
-            pass
-        raise ValueError("an ISO date such as 1975-07-01")
-    return value
 
 
 def _rising(band: tuple[float, float]) -> tuple[float, float]:
@@ -54,7 +37,7 @@ class IngestGridParams(Params):
     reference_field: str | None = quantity(
         "1", default=None, min_length=1, doc="Core field model that was removed, such as IGRF-13."
     )
-    reference_epoch: Annotated[str, pydantic.BeforeValidator(_iso_date)] | None = quantity(
+    reference_epoch: IsoDate | None = quantity(
         "1", default=None, doc="Date of the anomaly and its reference field, ISO."
     )
     anomaly_definition: str | None = quantity(
