@@ -1,28 +1,15 @@
-"""The spline kernels of a patch, compiled by numba: import this only when a patch is made.
-
-Fast-math leaves out ``nnan`` and ``ninf``: NaN positions must give NaN answers.
-"""
+"""The spline kernels of a patch, compiled by numba: import this only when a patch is made."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from magtiles.catalog.kernels.bspline import EDGE, HALO, NODE, Floats
-
-_Function = TypeVar("_Function", bound=Callable[..., Any])
-
-
-def _compile(function: _Function) -> _Function:
-    options = {"contract", "reassoc", "nsz", "arcp"}
-    jit: Any = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=options)
-    return cast(_Function, jit(function))
-
+from magtiles.catalog.kernels.jit import compiled as _compile
 
 _SIXTH = 1.0 / 6.0
 

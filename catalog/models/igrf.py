@@ -1,0 +1,35 @@
+"""The IGRF, from the package that carries its official coefficients."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+from magtiles.catalog.models.model import FieldModel
+from magtiles.catalog.models.read import read_model
+from magtiles.schemas.errors import QueryError, SourceError
+
+
+def load_igrf(generation: int = 14) -> FieldModel:
+    """The IGRF of a generation whose coefficients ppigrf carries (13 and 14).
+
+    Raises SourceError where ppigrf is not installed, QueryError for another generation.
+    """
+    package = importlib.util.find_spec("ppigrf")  # finds it without importing it, and pandas
+    if package is None or package.origin is None:
+        raise SourceError(
+            "the coefficients of the IGRF are not installed",
+            expected="the package ppigrf",
+            remedy="pip install 'magtiles[pipeline]'",
+        )
+    folder = Path(package.origin).parent
+    found = sorted(
+        int(path.stem[4:]) for path in folder.glob("IGRF*.shc") if path.stem[4:].isdigit()
+    )
+    if generation not in found:
+        raise QueryError(
+            f"no IGRF of generation {generation}",
+            where=folder,
+            expected=" or ".join(map(str, found)),
+        )
+    return read_model(folder / f"IGRF{generation}.shc")

@@ -1,0 +1,53 @@
+"""Reading a model, whatever its format."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from magtiles.catalog.models.cof import is_cof, read_cof, read_emm
+from magtiles.catalog.models.geographiclib import read_geographiclib
+from magtiles.catalog.models.model import FieldModel
+from magtiles.catalog.models.rows import significant_lines
+from magtiles.catalog.models.shc import is_shc, read_shc
+from magtiles.schemas.errors import FormatError
+
+_FORMATS = "SHC, COF of WMM, WMMHR or EMM, or .wmm of GeographicLib"
+
+_LARGEST = 256 * 1024 * 1024
+"""Bytes; the largest model published has 20 million."""
+
+
+def read_model(path: Path | str) -> FieldModel:
+    """The model in a file, told by its content, or in a folder that holds an EMM set.
+
+    Formats are SHC, COF of WMM, WMMHR or EMM, and GeographicLib's .wmm with its .wmm.cof.
+
+    Raises FormatError naming file and line (or byte), and OSError for a file that cannot be
+    read.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return read_emm(path)
+    if path.stat().st_size > _LARGEST:
+        raise FormatError("is larger than any model", where=path, expected=_FORMATS)
+    data = path.read_bytes()
+    if b"\0" in data and path.suffix == ".cof" and path.with_suffix("").is_file():
+        path = path.with_suffix("")
+        data = path.read_bytes()
+    if b"\0" in data:
+        raise FormatError("is no text", where=path, expected=_FORMATS)
+    lines = significant_lines(str(path), data.decode("utf-8-sig", errors="replace"))
+    if not lines:
+        raise FormatError("is empty", where=path, expected=_FORMATS, remedy="fetch it again")
+    if lines[0].words[0] in ("WMMF-1", "WMMF-2"):
+        return read_geographiclib(path, lines)
+    if is_shc(lines):
+        return read_shc(path, lines)
+    if is_cof(lines):
+        return read_cof(lines)
+    raise FormatError(
+        "is no model of a known format",
+        where=lines[0].where,
+        expected=_FORMATS,
+        remedy="secular variation alone is no model: give the folder of the set",
+    )
