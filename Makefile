@@ -43,7 +43,8 @@ build/sample/demo.toml: pipeline/sample.py catalog/kernels/dipole.py $(READY)
 	$(MAGTILES) sample $(@D)
 
 test: $(READY) ## Run the tests
-	$(BIN)/pytest
+	@# Small maps: waking threads for them would cost more than they save.
+	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/pytest
 
 check: $(READY) $(LINKS) ## Check formatting, lint and types
 	$(BIN)/ruff format --check .

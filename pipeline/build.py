@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import logging
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -36,6 +37,7 @@ _log = logging.getLogger(__name__)
 
 _MARGIN_HEIGHTS = 20.0
 _MARGIN_CELLS = 64
+_LEAST_GAP_M = 1.0
 
 
 @dataclass(frozen=True)
@@ -151,7 +153,16 @@ def _heights(wanted: Product, survey_height: float) -> list[float]:
             expected=f"heights of {survey_height:g} m and more",
             remedy="raise it, or set allow_downward_continuation = true (flagged, noisier)",
         )
-    return sorted({survey_height, *wanted.anomaly.heights_m})
+    heights = sorted({survey_height, *wanted.anomaly.heights_m})
+    for lower, upper in itertools.pairwise(heights):
+        if upper - lower < _LEAST_GAP_M:
+            raise CoverageError(
+                f"levels at {lower:.12g} and {upper:.12g} m are too close to interpolate between",
+                where="anomaly heights_m",
+                expected=f"levels {_LEAST_GAP_M:g} m apart or more, the survey's own among them",
+                remedy="leave one out",
+            )
+    return heights
 
 
 def _default_spacing(survey: Survey, heights: Sequence[float]) -> float:

@@ -9,7 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from magtiles.catalog.flags import QualityFlag, flag_attributes
-from magtiles.schemas.errors import ContractError, CoverageError
+from magtiles.schemas.errors import ContractError, CoverageError, ParameterError
 from magtiles.stages.crs import WGS84
 from magtiles.stages.declare import Params, Stage, quantity
 from magtiles.stages.field.direction import Ambient, AmbientSource
@@ -141,7 +141,7 @@ def _permit(grid: xr.Dataset, params: DeriveComponentsParams) -> None:
             remedy="raise it, or set allow_downward_continuation = true (flagged, noisier)",
         )
     if (params.latitude is None) != (params.longitude is None):
-        raise CoverageError(
+        raise ParameterError(
             "output nodes are given along one axis only", expected="both latitude and longitude"
         )
     if grid["height"].ndim:

@@ -87,8 +87,8 @@ def solve(plane_map: PlaneMap, ambient: AmbientSource, height_gain: float) -> An
     padded = pad(plane_map.values, padding)
     variation = [part - m for part, m in zip(directions, mean, strict=True)]
     total = _substitute(padded, padding, inversion, variation)
-    signal = max(float(plane_map.values.var()), np.finfo(float).tiny)
-    noise_to_signal = float(np.mean(plane_map.sigma**2)) / signal
+    signal, noise = float(plane_map.values.var()), float(np.mean(plane_map.sigma**2))
+    noise_to_signal = noise / signal if noise < signal else 1.0
     return AnomalousField(padding, wavenumbers, inversion, total, noise_to_signal)
 
 

@@ -17,7 +17,9 @@ Real = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _COARSEST = 8
-_SWEEPS = 40
+_SWEEPS = 40, 2000
+_WORK = 4e6
+"""Fewest and most sweeps of a level, and how many nodes they should visit in all."""
 _TAPER_CELLS = 20
 
 
@@ -98,30 +100,20 @@ def minimum_curvature(values: Real, missing: Mask) -> Real:
     filled = np.where(missing, 0.0, values)
     if not missing.any():
         return filled
-    start = _start(filled, missing)
-    filled[missing] = start[missing]
-    _relax(filled, np.argwhere(missing), _SWEEPS)
+    filled[missing] = _start(filled, missing)
+    nodes = np.argwhere(missing)
+    _relax(filled, nodes, int(np.clip(_WORK / len(nodes), *_SWEEPS)))
     return filled
 
 
 def _start(values: Real, missing: Mask) -> Real:
-    """A first guess for the missing nodes, from the same problem at half the resolution."""
-    weight, total = _halve((~missing).astype(float)), _halve(np.where(missing, 0.0, values))
-    coarse_missing = weight == 0.0
+    """A first guess for the missing nodes, from the same problem on every second node."""
+    coarse_missing = missing[::2, ::2]
     if coarse_missing.all() or min(values.shape) <= _COARSEST:
-        return np.full(values.shape, values[~missing].mean())
-    coarse = np.divide(total, weight, out=np.zeros_like(total), where=~coarse_missing)
-    coarse = minimum_curvature(coarse, coarse_missing)
-    rows, columns = (np.arange(n) / 2.0 - 0.25 for n in values.shape)
-    places = np.meshgrid(rows, columns, indexing="ij")
-    return np.asarray(ndimage.map_coordinates(coarse, places, order=1, mode="nearest"))
-
-
-def _halve(values: Real) -> Real:
-    """Sums over two by two blocks; a last odd row or column forms blocks of its own."""
-    rows, columns = (n % 2 for n in values.shape)
-    even = np.pad(values, ((0, rows), (0, columns)))
-    return np.asarray(even[::2, ::2] + even[1::2, ::2] + even[::2, 1::2] + even[1::2, 1::2])
+        return np.full(np.count_nonzero(missing), values[~missing].mean())
+    coarse = minimum_curvature(values[::2, ::2], coarse_missing)
+    places = np.argwhere(missing).T / 2.0
+    return np.asarray(ndimage.map_coordinates(coarse, places, order=3, mode="nearest"))
 
 
 @njit(cache=True, nogil=True)
