@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from magtiles.catalog.releases.anomaly import Anomaly
+from magtiles.catalog.releases.expected import ReleaseAnomaly
 from magtiles.catalog.releases.folder import check_folder, read_verified
 from magtiles.catalog.releases.manifest import MANIFEST_NAME, Manifest, read_manifest
 from magtiles.catalog.releases.store import DEFAULT_CACHE_BYTES, TileStore
@@ -28,9 +28,9 @@ class Release:
         self._store = TileStore(path, manifest, cache_bytes)
 
     @cached_property
-    def anomaly(self) -> Anomaly:
-        """Queries of the anomaly."""
-        return Anomaly(self.manifest, self._store, self._extrapolate)
+    def anomaly(self) -> ReleaseAnomaly:
+        """Queries of the anomaly, and of the whole field that is expected with it."""
+        return ReleaseAnomaly(self.manifest, self._store, self._extrapolate, self.file)
 
     @property
     def temporal(self) -> Any:
