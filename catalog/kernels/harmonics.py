@@ -60,8 +60,7 @@ class Harmonics:
     starts: NDArray[np.int64]
     seeds: Floats
 
-    @property
-    def tables(self) -> tuple[Any, ...]:
+    def tables(self) -> tuple[Floats, Floats, NDArray[np.int64], Floats, int]:
         """What the compiled sums take first."""
         return (self.recursion, self.coefficients, self.starts, self.seeds, self.degree)
 
@@ -157,7 +156,7 @@ def at_points(harmonics: Harmonics, places: Floats) -> Floats:
     places = places / harmonics.radius_m
     out = np.empty((len(places), harmonics.coefficients.shape[1] // 2))
     if len(places) <= _POINTS_AT_ONCE:
-        harmonics_compiled.at_points(*harmonics.tables, places, out)
+        harmonics_compiled.at_points(*harmonics.tables(), places, out)
         return out
     # Near a pole few orders count: places of like latitude go together.
     order = np.argsort(-np.abs(places[:, 2]) / np.linalg.norm(places, axis=1))
@@ -165,7 +164,7 @@ def at_points(harmonics: Harmonics, places: Floats) -> Floats:
 
     def work(part: NDArray[np.intp]) -> None:
         some = np.empty((len(part), out.shape[1]))
-        harmonics_compiled.at_points(*harmonics.tables, places[part], some)
+        harmonics_compiled.at_points(*harmonics.tables(), places[part], some)
         out[part] = some
 
     in_threads(work, parts)
@@ -176,5 +175,5 @@ def in_threads(work: Callable[[Any], None], parts: Iterable[Any]) -> None:
     """Do the parts side by side; as many as numba may use (NUMBA_NUM_THREADS)."""
     import numba
 
-    with ThreadPoolExecutor(numba.config.NUMBA_NUM_THREADS) as pool:
+    with ThreadPoolExecutor(numba.get_num_threads()) as pool:
         list(pool.map(work, parts))

@@ -5,7 +5,7 @@ from magtiles.catalog.models.evaluate import evaluate
 from magtiles.catalog.models.grid import evaluate_grid
 from magtiles.catalog.models.igrf import load_igrf
 from magtiles.catalog.models.model import FieldModel
-from magtiles.catalog.models.read import read_model
+from magtiles.catalog.models.read import parse_model, read_model
 
 __all__ = [
     "FieldModel",
@@ -13,5 +13,6 @@ __all__ = [
     "evaluate",
     "evaluate_grid",
     "load_igrf",
+    "parse_model",
     "read_model",
 ]

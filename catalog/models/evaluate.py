@@ -23,9 +23,7 @@ LOWEST_M = -12_000.0
 _KEPT = 6
 """Prepared functions kept for each model."""
 
-_prepared: weakref.WeakKeyDictionary[FieldModel, dict[Any, Harmonics | None]] = (
-    weakref.WeakKeyDictionary()
-)
+_prepared: weakref.WeakKeyDictionary[FieldModel, dict[Any, Any]] = weakref.WeakKeyDictionary()
 _lock = threading.Lock()
 
 
@@ -170,4 +168,5 @@ def _harmonics(
                 field_harmonics(values, model.reference_radius_km, gradient=gradient)
                 for values in model.line(segment)
             )
-        return kept[segment, gradient]
+        base, rate = kept[segment, gradient]
+        return base, rate

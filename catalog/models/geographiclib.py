@@ -31,6 +31,10 @@ def read_geographiclib(path: Path, lines: list[Line]) -> FieldModel:
     Yearly (or otherwise even) models are epochs, the set after them the secular variation, and
     a constant set, where there is one, is added to all.
     """
+    if lines[0].words != ["WMMF-1"] and lines[0].words != ["WMMF-2"]:
+        raise FormatError(
+            f"version {lines[0].words[0]}", where=lines[0].where, expected="WMMF-1 or WMMF-2"
+        )
     meta = _Metadata({line.words[0]: line for line in lines[1:]}, path)
     if meta.text("Type", "linear") != "linear":
         raise meta.error("Type", "linear")
@@ -48,7 +52,7 @@ def read_geographiclib(path: Path, lines: list[Line]) -> FieldModel:
         n_min,
         n_max,
         meta.number("Radius", REFERENCE_RADIUS_KM * 1000.0) / 1000.0,
-        epoch + step * np.arange(models),
+        np.array([epoch + step * i for i in range(models)]),
         coefficients,
         padded[models],
         (meta.number("MinTime", -math.inf), meta.number("MaxTime", math.inf)),
@@ -127,12 +131,7 @@ def _read_set(path: Path, data: bytes, at: int, *, full: bool) -> tuple[int, Flo
         raise FormatError(
             f"degree {degree}, order {order}", where=where, expected=f"up to {MAX_DEGREE}"
         )
-    m = np.repeat(np.arange(order + 1), degree + 1 - np.arange(order + 1))
-    n = (
-        m
-        + np.arange(len(m))
-        - np.repeat(np.searchsorted(m, np.arange(order + 1)), degree + 1 - np.arange(order + 1))
-    )
+    m, n = np.nonzero(np.tri(degree + 1, dtype=bool).T[: order + 1])  # by order, then degree
     cosines, sines = len(m), len(m) - degree - 1
     if at + 8 + 8 * (cosines + sines) > len(data):
         raise FormatError(

@@ -23,6 +23,9 @@ _ROWS_AT_ONCE = 24
 _SAME = 11
 """Decimals of a degree to which a northern and a southern latitude count as mirror images."""
 
+_EVEN = 1e-10
+"""Degrees by which longitudes may miss the nodes of an evenly divided circle."""
+
 
 @overload
 def evaluate_grid(
@@ -118,6 +121,7 @@ class _Grid:
         self.turn_lat, self.turn_lon = cosine_and_sine(lat), cosine_and_sine(lon)
 
     def parts(self, heights: Floats) -> list[_Part]:
+        absolute: Floats
         absolute, of_row = np.unique(np.round(np.abs(self.lat), _SAME), return_inverse=True)
         parts = []
         for level, height in enumerate(heights):
@@ -136,7 +140,7 @@ class _Grid:
         orders = len(self.harmonics.seeds)
         north = np.empty((len(places), functions, orders), dtype=np.complex128)
         south = np.empty_like(north)
-        along_parallels(*self.harmonics.tables, places / self.harmonics.radius_m, north, south)
+        along_parallels(*self.harmonics.tables(), places / self.harmonics.radius_m, north, south)
         for row, i in zip(part.rows, part.of_row, strict=True):
             values = self.circle.sum_orders(south[i] if self.lat[row] < 0.0 else north[i])
             turn_to_ned(
@@ -176,8 +180,8 @@ def _nodes_of_circle(longitudes: Floats, orders: int) -> int:
         return 0
     step = (longitudes[-1] - longitudes[0]) / (len(longitudes) - 1)
     even = longitudes[0] + step * np.arange(len(longitudes))
-    if step <= 0.0 or np.abs(longitudes - even).max() > 1e-9:
+    if step <= 0.0 or np.abs(longitudes - even).max() > _EVEN:
         return 0
     nodes = round(360.0 / step)
     enough = nodes >= 2 * orders and 8 * len(longitudes) >= nodes
-    return nodes if enough and abs(nodes * step - 360.0) < 1e-9 * nodes else 0
+    return nodes if enough and abs(nodes * step - 360.0) <= _EVEN else 0

@@ -36,13 +36,22 @@ def read_model(path: Path | str) -> FieldModel:
         data = path.read_bytes()
     if b"\0" in data:
         raise FormatError("is no text", where=path, expected=_FORMATS)
-    lines = significant_lines(str(path), data.decode("utf-8-sig", errors="replace"))
+    text = data.decode("utf-8-sig", errors="replace")
+    if text.startswith("WMMF-"):
+        return read_geographiclib(path, significant_lines(str(path), text))
+    return parse_model(text, str(path))
+
+
+def parse_model(text: str, file: str) -> FieldModel:
+    """The model in the text of an SHC or COF file; `file` names it in messages.
+
+    Raises FormatError naming file and line.
+    """
+    lines = significant_lines(file, text)
     if not lines:
-        raise FormatError("is empty", where=path, expected=_FORMATS, remedy="fetch it again")
-    if lines[0].words[0] in ("WMMF-1", "WMMF-2"):
-        return read_geographiclib(path, lines)
+        raise FormatError("is empty", where=file, expected=_FORMATS, remedy="fetch it again")
     if is_shc(lines):
-        return read_shc(path, lines)
+        return read_shc(lines)
     if is_cof(lines):
         return read_cof(lines)
     raise FormatError(

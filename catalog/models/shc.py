@@ -31,7 +31,7 @@ def is_shc(lines: list[Line]) -> bool:
     return len(words) in (5, 7) and all(w.lstrip("-").isdigit() for w in words[:5])
 
 
-def read_shc(path: Path, lines: list[Line]) -> FieldModel:
+def read_shc(lines: list[Line]) -> FieldModel:
     """The model in the lines of an SHC file; FormatError names file and line.
 
     A file with one time is a static model. A spline of order above two is given by order - 1
@@ -57,7 +57,14 @@ def read_shc(path: Path, lines: list[Line]) -> FieldModel:
     if order > 2 and count_ > 1:
         times, coefficients = _straighten(lines[0], times, coefficients, order, steps)
     return FieldModel(
-        path.stem, n_min, n_max, REFERENCE_RADIUS_KM, times, coefficients, None, valid
+        Path(lines[0].file).stem,
+        n_min,
+        n_max,
+        REFERENCE_RADIUS_KM,
+        times,
+        coefficients,
+        None,
+        valid,
     )
 
 

@@ -1,4 +1,7 @@
-"""Ask a release for the anomaly at positions. Heights are metres above the WGS84 ellipsoid."""
+"""Ask a release for the anomaly, or a model for the field, at positions.
+
+Heights are metres above the WGS84 ellipsoid.
+"""
 
 from __future__ import annotations
 
@@ -14,10 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtiles.catalog.flags import QualityFlag
+from magtiles.pipeline import model_query
 from magtiles.pipeline.output import print_json, print_table
 from magtiles.schemas.errors import FormatError, UsageError
 
-HELP = "print the anomaly, its uncertainty and flags at positions"
+HELP = "print the anomaly of a release, or the field of a model, at positions"
 NEEDS_PIPELINE = False
 
 _CORE = ("north", "east", "down", "horizontal", "total", "declination", "inclination")
@@ -26,7 +30,27 @@ _COLUMNS = ("latitude", "longitude", "height")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``magtiles query``."""
-    parser.add_argument("release", type=Path, metavar="RELEASE", help="folder of a release")
+    parser.add_argument(
+        "release", type=Path, nargs="?", metavar="RELEASE", help="folder of a release"
+    )
+    parser.add_argument(
+        "--model",
+        metavar="ID_OR_FILE",
+        help="a field model instead: igrf13, igrf14, or a file (SHC, COF, .wmm) or EMM folder",
+    )
+    parser.add_argument(
+        "--date",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="DATE",
+        help="of a model: ISO date or decimal year; one serves all positions",
+    )
+    parser.add_argument(
+        "--allow-extrapolated",
+        action="store_true",
+        help="answer for dates beyond the model's validity, and say so",
+    )
     for option, meaning in (
         ("--lat", "geodetic latitudes, degrees north"),
         ("--lon", "longitudes, degrees east"),
@@ -56,13 +80,45 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Answer every position, in order; NaN where the release does not know."""
+    if (arguments.release is None) == (arguments.model is None):
+        raise UsageError("nothing to ask, or two", expected="either RELEASE or --model ID_OR_FILE")
     positions = _positions(arguments)
-    answers = answer(arguments.release, positions, above_reference=arguments.height_above_reference)
+    if arguments.model is not None:
+        answers, show = _ask_model(arguments, positions), model_query.print_answers
+    else:
+        answers, show = _ask_release(arguments, positions), _print_answers
     if arguments.json:
         print_json(answers[0] if _is_single(arguments) else answers)
     else:
-        _print_answers(answers)
+        show(answers)
     return 0
+
+
+def _ask_release(
+    arguments: argparse.Namespace, positions: NDArray[np.float64]
+) -> list[dict[str, Any]]:
+    if arguments.date or arguments.allow_extrapolated:
+        raise UsageError("given with a release", where="--date", expected="--model")
+    return answer(arguments.release, positions, above_reference=arguments.height_above_reference)
+
+
+def _ask_model(
+    arguments: argparse.Namespace, positions: NDArray[np.float64]
+) -> list[dict[str, Any]]:
+    if arguments.height_above_reference:
+        raise UsageError("given with a model", where="--height-above-reference")
+    if len(arguments.date) not in (1, len(positions)):
+        raise UsageError(
+            f"{len(arguments.date)} dates",
+            where="--date",
+            expected="one" if len(positions) == 1 else f"1 or {len(positions)}",
+        )
+    return model_query.answer(
+        model_query.find_model(arguments.model),
+        positions,
+        arguments.date,
+        allow_extrapolated=arguments.allow_extrapolated,
+    )
 
 
 def answer(
