@@ -107,6 +107,9 @@ def _breach(
         expected = " and ".join(f"{_BOUNDS[name]} {bound:g}" for name, bound in bounds)
     elif problem.validator == "anyOf" and not path:
         what, expected = f"dims are {document.get('dims')}", "(y, x) or (latitude, longitude)"
+    elif problem.validator == "anyOf" and all("required" in c for c in problem.validator_value):
+        names = [name for choice in problem.validator_value for name in choice["required"]]
+        what, expected = f"has none of {', '.join(names)}", "at least one of them"
     return ContractError(what, where=place, expected=expected, remedy=f"see contract {contract}")
 
 

@@ -3,14 +3,28 @@
 from __future__ import annotations
 
 from magtiles.stages.declare import Stage
-from magtiles.stages.field import components, continuation, crop, voids
+from magtiles.stages.field import (
+    carry_forward,
+    components,
+    continuation,
+    core_field,
+    crop,
+    evaluate_model,
+    rereference,
+    voids,
+)
 from magtiles.stages.ingest import grid
 from magtiles.stages.release import tiles
 
 STAGES: tuple[Stage, ...] = (
     grid.STAGE,
+    evaluate_model.STAGE,
+    core_field.GRID_STAGE,
+    core_field.TRACK_STAGE,
+    rereference.STAGE,
     crop.STAGE,
     voids.STAGE,
+    carry_forward.STAGE,
     continuation.STAGE,
     components.STAGE,
     tiles.STAGE,

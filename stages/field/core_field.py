@@ -1,0 +1,224 @@
+"""The core field where a dataset is, and the stages that subtract it: ``remove-core-field``.
+
+The total-field anomaly is what a magnetometer measures less the core field's magnitude,
+|F| - |F_core|, at each sample's own place, height and date (Canciani and Raquet 2016).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+
+from magtiles.catalog.models import FieldModel, evaluate
+from magtiles.schemas.errors import ContractError
+from magtiles.stages.crs import dataset_to_wgs84
+from magtiles.stages.declare import OPTIONAL_FILE, IsoDate, Params, Stage, quantity
+from magtiles.stages.field.geometry import axes, variable
+from magtiles.stages.ingest.field_model import named_model
+from magtiles.stages.ingest.source import TOTAL_FIELD_ANOMALY
+
+Real = NDArray[np.float64]
+
+NO_REFERENCE = "none"
+"""`reference_field` of a grid from which no core field was removed: the total field itself."""
+
+_WEAKEST_NT = 10_000.0
+"""Below the weakest core field anywhere up to 1000 km, some 15,000 nT."""
+
+
+@dataclass(frozen=True)
+class Core:
+    """A core field model at a date, or, with several dates, at each place's own."""
+
+    model: FieldModel
+    date: Any
+    allow_extrapolated: bool = False
+
+    def vector(self, latitude: Real, longitude: Real, height: ArrayLike) -> Real:
+        """North, east, down (..., 3), nT, at WGS84 degrees and ellipsoidal metres (...)."""
+        return evaluate(
+            self.model,
+            latitude,
+            longitude,
+            height,
+            self.date,
+            allow_extrapolated=self.allow_extrapolated,
+        )
+
+    def total(self, latitude: Real, longitude: Real, height: ArrayLike) -> Real:
+        """Magnitude (...), nT; where a coordinate is NaN, NaN."""
+        known = np.isfinite(latitude) & np.isfinite(longitude) & np.isfinite(height)
+        place = (np.where(known, a, 0.0) for a in (latitude, longitude, height))
+        return np.where(known, np.linalg.norm(self.vector(*place), axis=-1), np.nan)
+
+    @property
+    def note(self) -> str:
+        """What a definition adds where the model is used outside the span it was made for."""
+        return (
+            ""
+            if np.all(self.model.covers(self.date))
+            else f" ({self.model.name} extrapolated in time)"
+        )
+
+
+def grid_places(grid: xr.Dataset) -> tuple[Real, Real, Real]:
+    """WGS84 latitude and longitude (degrees) and ellipsoidal height (m) of a grid's nodes.
+
+    Each (rows, columns). Raises ContractError where the height of the survey's reference
+    surface is not known.
+    """
+    x, y = np.meshgrid(*axes(grid)[::-1])
+    longitude, latitude = dataset_to_wgs84(grid).transform(x, y)
+    height = np.broadcast_to(ellipsoidal_height(grid), x.shape)
+    return np.asarray(latitude), np.asarray(longitude), height
+
+
+def ellipsoidal_height(dataset: xr.Dataset) -> Real:
+    """Height above the WGS84 ellipsoid, m, of a grid or track: scalar or of its shape.
+
+    Raises ContractError where heights count from a surface that the dataset does not know.
+    """
+    height = np.asarray(dataset["height"].values, np.float64)
+    reference = str(dataset.attrs["height_reference"])
+    if reference == "ellipsoid":
+        return height
+    if "reference_surface_height" not in dataset:
+        surface = reference.replace("_", " ")
+        raise ContractError(
+            f"heights count from {surface}, whose own height is not known",
+            where=dataset.attrs.get("source"),
+            expected="heights above the ellipsoid, or a reference_surface_height",
+            remedy="a core field cannot be evaluated above an unknown surface"
+            + (": set undulation_m in the source's TOML" if "sea" in reference else ""),
+        )
+    return height + np.asarray(dataset["reference_surface_height"].values, np.float64)
+
+
+class RemoveCoreFieldParams(Params):
+    """Parameters of remove-core-field, for grids and tracks."""
+
+    reference_field: str = quantity(
+        "1", default="IGRF-14", min_length=1, doc="Core field model to subtract."
+    )
+    allow_extrapolated: bool = quantity(
+        "1", default=False, doc="Permit dates outside the span that the model is valid for."
+    )
+
+
+class RemoveFromGridParams(RemoveCoreFieldParams):
+    """Parameters of remove-core-field for a grid."""
+
+    reference_epoch: IsoDate | None = quantity(
+        "1", default=None, doc="Date of the core field; default the grid's own reference_epoch."
+    )
+
+
+def remove_from_grid(
+    grid: xr.Dataset, *, params: RemoveFromGridParams, model: Path | None = None
+) -> xr.Dataset:
+    """The total-field anomaly (nT, float64) of a grid of the total field itself.
+
+    Such a grid is an anomaly-grid/1 whose `reference_field` is "none": nothing was removed.
+    The core field is evaluated at every node and its height, at one date.
+
+    Raises ContractError for a grid that has a reference field already, that is no total
+    field, or whose heights count from an unknown surface.
+    """
+    removed = str(grid.attrs["reference_field"])
+    if removed != NO_REFERENCE:
+        raise ContractError(
+            f"'{removed}' was already removed from this grid",
+            where="reference_field",
+            expected=f"'{NO_REFERENCE}': the total field itself",
+            remedy="to change the reference field run re-reference",
+        )
+    epoch = params.reference_epoch or str(grid.attrs["reference_epoch"])
+    used = named_model(params.reference_field, model, role="model")
+    core = Core(used, epoch, params.allow_extrapolated)
+    total = grid["magnetic_anomaly"]
+    _check_total(total)
+    anomaly = total.values.astype(np.float64) - core.total(*grid_places(grid))
+    return with_anomaly(grid, anomaly).assign_attrs(
+        reference_field=used.name,
+        reference_epoch=epoch,
+        anomaly_definition=TOTAL_FIELD_ANOMALY + core.note,
+    )
+
+
+def with_anomaly(grid: xr.Dataset, anomaly: Real) -> xr.Dataset:
+    """The grid with other anomaly values (nT), in double precision."""
+    return grid.assign(
+        magnetic_anomaly=variable(grid, anomaly, "nT", "total-field magnetic anomaly")
+    )
+
+
+def remove_from_track(
+    track: xr.Dataset, *, params: RemoveCoreFieldParams, model: Path | None = None
+) -> xr.Dataset:
+    """The total-field anomaly (time,) along a track, nT.
+
+    The core field is that of each sample's own date, place and height; its magnitude is kept
+    as `core_field_total`. Diurnal variations are still in the anomaly. NaN where a sample has
+    no place, height or field.
+
+    Raises ContractError for a track without `field_total`, or with heights above an unknown
+    surface.
+    """
+    if "field_total" not in track:
+        raise ContractError(
+            "'field_total' is missing",
+            where=track.attrs.get("source"),
+            expected="the measured total field, nT",
+            remedy="calibrate the vector magnetometer first: its length is the total field",
+        )
+    _check_total(track["field_total"])
+    used = named_model(params.reference_field, model, role="model")
+    core = Core(used, track["time"].values, params.allow_extrapolated)
+    place = track["latitude"].values, track["longitude"].values
+    reference = core.total(*place, np.broadcast_to(ellipsoidal_height(track), place[0].shape))
+    anomaly = track["field_total"].values.astype(np.float64) - reference
+    return track.assign(
+        core_field_total=("time", reference, {"units": "nT", "long_name": "core field"}),
+        magnetic_anomaly=(
+            "time", anomaly, {"units": "nT", "long_name": "total-field magnetic anomaly"}
+        ),
+    ).assign_attrs(
+        reference_field=used.name,
+        anomaly_definition=f"{TOTAL_FIELD_ANOMALY} at each sample's date{core.note}",
+    )  # fmt: skip
+
+
+def _check_total(total: xr.DataArray) -> None:
+    """Refuse what is an anomaly, or no nanotesla, under the name of a total field."""
+    middle = float(np.nanmedian(total.values)) if np.isfinite(total.values).any() else np.nan
+    if not middle >= _WEAKEST_NT:
+        raise ContractError(
+            f"its median is {middle:g} nT",
+            where=total.name,
+            expected=f"the total field, more than {_WEAKEST_NT:g} nT anywhere on the Earth",
+            remedy="if this is an anomaly already, say what reference_field was removed",
+        )
+
+
+GRID_STAGE = Stage(
+    name="remove-core-field",
+    version=1,
+    params=RemoveFromGridParams,
+    inputs={"grid": "anomaly-grid/1", "model": OPTIONAL_FILE},
+    output="anomaly-grid/1",
+    run=remove_from_grid,
+)
+
+TRACK_STAGE = Stage(
+    name="remove-core-field",
+    version=1,
+    params=RemoveCoreFieldParams,
+    inputs={"track": "track/1", "model": OPTIONAL_FILE},
+    output="track-anomaly/1",
+    run=remove_from_track,
+)
