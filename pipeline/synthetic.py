@@ -211,8 +211,8 @@ def _missing(spec: SampleSpec, x: Floats, y: Floats, rng: np.random.Generator) -
     if spec.coast:
         missing |= x - x[0] < _coastline(y, rng)[:, None]
     if spec.void:
-        east = (x - (x[0] + 0.70 * (x[-1] - x[0]))) / 6000.0
-        north = (y - (y[0] + 0.65 * (y[-1] - y[0]))) / 4000.0
+        east = (x - (x[0] + 0.74 * (x[-1] - x[0]))) / 6000.0
+        north = (y - (y[0] + 0.60 * (y[-1] - y[0]))) / 4000.0
         missing |= east**2 + north[:, None] ** 2 < 1.0
     return missing
 
