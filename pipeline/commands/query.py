@@ -9,9 +9,9 @@ import argparse
 import contextlib
 import csv
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,9 @@ from magtiles.catalog.flags import QualityFlag
 from magtiles.pipeline import model_query
 from magtiles.pipeline.output import print_json, print_table
 from magtiles.schemas.errors import FormatError, UsageError
+
+if TYPE_CHECKING:
+    from magtiles.catalog.releases.expected import ReleaseAnomaly
 
 HELP = "print the anomaly of a release, or the field of a model, at positions"
 NEEDS_PIPELINE = False
@@ -44,7 +47,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="extend",
         default=[],
         metavar="DATE",
-        help="of a model: ISO date or decimal year; one serves all positions",
+        help="ISO date or decimal year, UTC; one serves all positions. For a release it adds the "
+        "whole field: north, east, down of core and anomaly, and as total |core| + anomaly",
     )
     parser.add_argument(
         "--allow-extrapolated",
@@ -97,9 +101,22 @@ def run(arguments: argparse.Namespace) -> int:
 def _ask_release(
     arguments: argparse.Namespace, positions: NDArray[np.float64]
 ) -> list[dict[str, Any]]:
-    if arguments.date or arguments.allow_extrapolated:
-        raise UsageError("given with a release", where="--date", expected="--model")
-    return answer(arguments.release, positions, above_reference=arguments.height_above_reference)
+    if arguments.allow_extrapolated:
+        raise UsageError("given with a release", where="--allow-extrapolated", expected="--model")
+    if arguments.date:
+        _check_dates(arguments.date, len(positions))
+        if arguments.height_above_reference:
+            raise UsageError(
+                "given with --date",
+                where="--height-above-reference",
+                expected="heights above the ellipsoid, where a core field can be evaluated",
+            )
+    return answer(
+        arguments.release,
+        positions,
+        above_reference=arguments.height_above_reference,
+        dates=arguments.date,
+    )
 
 
 def _ask_model(
@@ -107,12 +124,7 @@ def _ask_model(
 ) -> list[dict[str, Any]]:
     if arguments.height_above_reference:
         raise UsageError("given with a model", where="--height-above-reference")
-    if len(arguments.date) not in (1, len(positions)):
-        raise UsageError(
-            f"{len(arguments.date)} dates",
-            where="--date",
-            expected="one" if len(positions) == 1 else f"1 or {len(positions)}",
-        )
+    _check_dates(arguments.date, len(positions))
     return model_query.answer(
         model_query.find_model(arguments.model),
         positions,
@@ -121,12 +133,26 @@ def _ask_model(
     )
 
 
+def _check_dates(dates: Sequence[str], positions: int) -> None:
+    if len(dates) not in (1, positions):
+        raise UsageError(
+            f"{len(dates)} dates",
+            where="--date",
+            expected="one" if positions == 1 else f"1 or {positions}",
+        )
+
+
 def answer(
-    folder: Path, positions: NDArray[np.float64], *, above_reference: bool
+    folder: Path,
+    positions: NDArray[np.float64],
+    *,
+    above_reference: bool,
+    dates: Sequence[str] = (),
 ) -> list[dict[str, Any]]:
     """What a release says at positions (n, 3): latitude, longitude (deg) and height (m).
 
-    Core field keys are None: a release is asked without a date.
+    With one date, or one for each position, the field that is expected there: core and
+    anomaly. Without, its keys are None.
     """
     from magtiles.catalog import open_release
 
@@ -146,10 +172,11 @@ def answer(
     vector = anomaly.vector(**place)
     uncertainty = anomaly.uncertainty(**place)
     flags = anomaly.flags(**place)
+    expected = _expected(anomaly, positions, dates) if dates else [dict.fromkeys(_CORE)]
     return [
         {
             **dict(zip(_COLUMNS, map(float, positions[i]), strict=True)),
-            **dict.fromkeys(_CORE),
+            **expected[i if dates else 0],
             "anomaly": float(total[i]),
             "anomaly_north": float(vector[i, 0]),
             "anomaly_east": float(vector[i, 1]),
@@ -159,6 +186,21 @@ def answer(
         }
         for i in range(len(positions))
     ]
+
+
+def _expected(
+    anomaly: ReleaseAnomaly, positions: NDArray[np.float64], dates: Sequence[str]
+) -> list[dict[str, float]]:
+    """Elements of the expected field, nT and degrees; the total is |core| + total anomaly."""
+    when = np.broadcast_to(np.array(dates), len(positions))
+    lat, lon, h = positions.T
+    total = anomaly.expected_total_field(lat, lon, h, when)
+    north, east, down = anomaly.expected_vector(lat, lon, h, when).T
+    horizontal = np.hypot(north, east)
+    declination = np.degrees(np.arctan2(east, north))
+    inclination = np.degrees(np.arctan2(down, horizontal))
+    rows = zip(north, east, down, horizontal, total, declination, inclination, strict=True)
+    return [dict(zip(_CORE, map(float, row), strict=True)) for row in rows]
 
 
 def flag_names(bits: int) -> list[str]:
@@ -245,7 +287,9 @@ def _numbers(text: str) -> list[float]:
 
 
 def _print_answers(answers: list[dict[str, Any]]) -> None:
-    header = ("latitude", "longitude", "height m", "anomaly nT", "north", "east", "down")
+    header = ["latitude", "longitude", "height m", "anomaly nT", "north", "east", "down"]
+    field = ("total", "declination", "inclination") if answers[0]["total"] is not None else ()
+    units = {"total": "total field nT", "declination": "declination deg"}
     rows = [
         (
             f"{a['latitude']:.6f}",
@@ -253,8 +297,9 @@ def _print_answers(answers: list[dict[str, Any]]) -> None:
             f"{a['height']:.1f}",
             *(f"{a[k]:.2f}" for k in ("anomaly", "anomaly_north", "anomaly_east", "anomaly_down")),
             f"{a['uncertainty']:.2f}",
+            *(f"{a[k]:.2f}" for k in field),
             " ".join(a["flags"]) or "-",
         )
         for a in answers
     ]
-    print_table((*header, "1 sigma", "flags"), rows)
+    print_table([*header, "1 sigma", *(units.get(k, k) for k in field), "flags"], rows)
