@@ -103,8 +103,6 @@ def _coefficients(rows: list[Line], columns: int) -> tuple[int, int, Floats]:
     if end is None and columns == 6:
         raise FormatError("no line of nines at the end", where=rows[-1].where, remedy=_AGAIN)
     rows = rows[:end]
-    if not rows:
-        raise FormatError("no coefficients before the line of nines", where="COF")
     read = [numbers(line, columns) for line in rows]
     n_min, n_max = read[0][0], max(n for n, _, _ in read)
     table = Table((columns - 2) // 2, n_max)

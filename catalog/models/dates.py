@@ -54,18 +54,21 @@ def _as_utc(date: Any) -> np.datetime64:
         raise QueryError(f"date is {date!r}", expected=_EXPECTED) from None
 
 
-def _from_text(text: NDArray[np.str_]) -> NDArray[Any]:
-    try:
-        return text.astype(np.float64)
-    except ValueError:
-        pass
-    values = np.empty(text.shape, dtype="M8[us]")
+def _from_text(text: NDArray[np.str_]) -> NDArray[np.float64]:
+    years = np.empty(text.shape)
     for index, one in np.ndenumerate(text):
         try:
-            values[index] = _as_utc(datetime.fromisoformat(str(one)))
+            years[index] = float(one)
         except ValueError:
-            raise QueryError(f"date is {str(one)!r}", expected=_EXPECTED) from None
-    return values
+            years[index] = _from_calendar(np.asarray(_from_iso(str(one))))
+    return years
+
+
+def _from_iso(text: str) -> np.datetime64:
+    try:
+        return _as_utc(datetime.fromisoformat(text))
+    except ValueError:
+        raise QueryError(f"date is {text!r}", expected=_EXPECTED) from None
 
 
 def _from_calendar(dates: NDArray[Any]) -> NDArray[np.float64]:

@@ -34,7 +34,7 @@ class FieldModel:
 
     Between epochs each coefficient is linear in the decimal year. That is how the IGRF is
     defined, and differs from linear in elapsed days where a leap year lies between epochs: by
-    at most 0.75 day of secular variation.
+    at most 0.8 day of secular variation.
     """
 
     name: str
