@@ -87,7 +87,7 @@ def carry_forward(
     Assumed is that all magnetisation is induced: parallel to the core field and proportional
     to its strength. Each wavenumber of the anomaly holds theta = k f_d + i (k_y f_y + k_x f_x)
     once for the direction f that it is measured along and once for that of the magnetisation
-    (Blakely 1995, eq. 11.34), so that::
+    (Blakely 1995, sec. 12.3), so that::
 
         T_new = T_old (F_new / F_old) (theta_new / theta_old)^2
 
