@@ -29,6 +29,9 @@ MAX_DEGREE = 2700
 _POINTS_AT_ONCE = 1024
 """Places that share one passage through the coefficients."""
 
+_SORTED_FROM = 40
+"""Degree above which leaving out negligible orders is worth sorting the points."""
+
 
 def count(degree: int) -> int:
     """Number of Gauss coefficients of the degrees 1 to `degree`."""
@@ -158,17 +161,22 @@ def at_points(harmonics: Harmonics, places: Floats) -> Floats:
     if len(places) <= _POINTS_AT_ONCE:
         harmonics_compiled.at_points(*harmonics.tables(), places, out)
         return out
-    # Near a pole few orders count: places of like latitude go together.
-    order = np.argsort(-np.abs(places[:, 2]) / np.linalg.norm(places, axis=1))
-    parts = [order[i : i + _POINTS_AT_ONCE] for i in range(0, len(order), _POINTS_AT_ONCE)]
+    order = None
+    if harmonics.degree > _SORTED_FROM:
+        # Near a pole few orders count: places of like latitude go together.
+        order = np.argsort(-np.abs(places[:, 2]) / np.linalg.norm(places, axis=1))
+        places = places[order]
 
-    def work(part: NDArray[np.intp]) -> None:
-        some = np.empty((len(part), out.shape[1]))
-        harmonics_compiled.at_points(*harmonics.tables(), places[part], some)
-        out[part] = some
+    def work(start: int) -> None:
+        part = slice(start, start + _POINTS_AT_ONCE)
+        harmonics_compiled.at_points(*harmonics.tables(), places[part], out[part])
 
-    in_threads(work, parts)
-    return out
+    in_threads(work, range(0, len(places), _POINTS_AT_ONCE))
+    if order is None:
+        return out
+    given = np.empty_like(out)
+    given[order] = out
+    return given
 
 
 def in_threads(work: Callable[[Any], None], parts: Iterable[Any]) -> None:

@@ -143,10 +143,10 @@ def _fields(model: FieldModel, places: Floats, year: Floats, gradient: bool) -> 
     """Field and tensor (n, 3 or 8) in Earth-centred axes: base and rate of each segment."""
     fields = np.zeros((len(places), 8 if gradient else 3))
     segments = model.segments(year)
-    for segment in np.unique(segments):
+    for segment in np.unique(segments).tolist():
         here = segments == segment
         some = slice(None) if here.all() else here
-        base, rate = _harmonics(model, int(segment), gradient)
+        base, rate = _harmonics(model, segment, gradient)
         if base is not None:
             fields[some] += at_points(base, places[some])
         elapsed = year[some] - model.epochs[segment]
