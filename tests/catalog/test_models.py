@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from datetime import UTC, date, datetime, timedelta, timezone
 from typing import Any
 
@@ -154,3 +156,12 @@ def test_core_field_gradient_of_middle_latitudes() -> None:
 def test_axes_of_a_grid(axis: Any) -> None:
     with pytest.raises(QueryError, match="latitudes of shape"):
         evaluate_grid(varying(), axis, [0.0], 0.0, 2003.0)
+
+
+def test_importing_models_compiles_nothing() -> None:
+    program = "import sys, magtiles.catalog.models; print(*{m.split('.')[0] for m in sys.modules})"
+    loaded = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    ).stdout.split()
+    assert "numpy" in loaded
+    assert not {"numba", "pandas", "ppigrf", "scipy", "xarray"} & set(loaded)

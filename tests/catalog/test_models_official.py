@@ -90,11 +90,11 @@ def test_igrf_of_ppigrf(year: float) -> None:
 
 def test_decimal_years_are_not_elapsed_days() -> None:
     """On 2024-01-01 ppigrf, which counts days since 2020, is 0.6 day behind the decimal year."""
-    lat, lon = np.linspace(-80.0, 80.0, 50), np.linspace(-180.0, 180.0, 50)
+    lat, lon = np.meshgrid(np.linspace(-85.0, 85.0, 60), np.linspace(-180.0, 180.0, 80))
     date = datetime(2024, 1, 1)  # noqa: DTZ001
     east, north, up = ppigrf.igrf(lon, lat, 0.0, date)
     theirs = np.stack([north[0], east[0], -up[0]], axis=-1)
     ours = evaluate(load_igrf(14), lat, lon, 0.0, date)
     days = date - datetime(2020, 1, 1) - 0.8 * timedelta(days=1827)  # noqa: DTZ001
     assert days == timedelta(days=-0.6)
-    assert 0.05 < np.abs(ours - theirs).max() < 0.5
+    assert 0.3 < np.abs(ours - theirs).max() < 0.4  # measured 0.361 nT
