@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,7 +48,7 @@ def numbers(line: Line, columns: int) -> tuple[int, int, list[float]]:
         values = [float(word) for word in line.words[2:]]
     except ValueError as caught:
         raise FormatError(str(caught), where=line.where, expected="numbers") from None
-    if not np.isfinite(values).all():
+    if not all(map(math.isfinite, values)):
         raise FormatError("a coefficient is not finite", where=line.where)
     if not (1 <= n <= MAX_DEGREE and abs(m) <= n):
         raise FormatError(
@@ -79,7 +80,7 @@ class Table:
         self.values[:, place] = values
 
     def require(self, last: Line, n_min: int, order: int) -> None:
-        """Raise FormatError unless each degree from `n_min` has each order up to `order`."""
+        """Raise FormatError, at the last line, unless each degree from `n_min` has each order up to `order`."""
         for n in range(n_min, self.n_max + 1):
             top = min(n, order)
             wanted = slice(n * n - 1, n * n + 2 * top)
@@ -88,7 +89,7 @@ class Table:
             missing = int(np.flatnonzero(~self.seen[wanted])[0])
             m = (missing + 1) // 2 * (1 if missing % 2 else -1)
             raise FormatError(
-                f"degree {n}, order {m} is missing at the end",
+                f"degree {n}, order {m} is missing",
                 where=last.where,
                 expected=f"degrees {n_min} to {self.n_max} with orders up to {order}",
                 remedy="the file may be truncated: fetch it again",
