@@ -80,7 +80,7 @@ class Table:
         self.values[:, place] = values
 
     def require(self, last: Line, n_min: int, order: int) -> None:
-        """Raise FormatError, at the last line, unless each degree from `n_min` has each order up to `order`."""
+        """Raise FormatError, at the last line, unless all orders up to `order` are there."""
         for n in range(n_min, self.n_max + 1):
             top = min(n, order)
             wanted = slice(n * n - 1, n * n + 2 * top)
