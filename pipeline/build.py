@@ -17,8 +17,7 @@ from magtiles.catalog.kernels.bspline import HALO
 from magtiles.catalog.releases.lattice import Lattice
 from magtiles.pipeline import receipts
 from magtiles.pipeline.artifacts import open_artifact
-from magtiles.pipeline.cutting import cut_all
-from magtiles.pipeline.preview import write_preview
+from magtiles.pipeline.cutting import cutting
 from magtiles.pipeline.product import Product, load_product
 from magtiles.pipeline.progress import Progress, silent
 from magtiles.pipeline.runner import StageResult, run_stage
@@ -110,9 +109,15 @@ def _build(
     heights = _heights(wanted, survey.height_m)
     spacing = wanted.anomaly.spacing_m or _default_spacing(survey, heights)
     lattice = plan_lattice(survey.bounds, spacing, wanted.anomaly.tile_deg)
-    levels = [_level(wanted, survey, lattice, h, folder, steps) for h in heights]
-    cut = cut_all(lattice, levels, folder / "tiles", progress)
-    return _publish(wanted, store, folder, data, cut, levels, steps)
+    with cutting(lattice, len(heights)) as cutter:
+        levels, pictures = [], []
+        for height in heights:
+            levels.append(_level(wanted, survey, lattice, height, folder, steps))
+            pictures.append(folder / "preview" / f"{height:.12g}m.png")
+            cutter.draw(levels[-1], pictures[-1], wanted.product.name, wanted.product.version)
+        cut = cutter.cut(levels, folder / "tiles", progress)
+        cutter.finish_drawing()
+    return _publish(wanted, store, folder, data, cut, levels, pictures, steps)
 
 
 def _survey(wanted: Product, folder: Path, data: Path | None, steps: _Steps) -> Survey:
@@ -203,18 +208,14 @@ def _publish(
     data: Path | None,
     cut: Sequence[MeasuredTile],
     levels: Sequence[Path],
+    pictures: Sequence[Path],
     steps: _Steps,
 ) -> PublishResult:
-    extra = {}
+    extra = {f"preview/{picture.name}": picture for picture in pictures}
     with open_artifact(levels[0]) as lowest:
         coefficients = reference_coefficients(str(lowest.attrs["reference_field"]))
     if coefficients is not None:
         extra["core_field.shc"] = coefficients
-    for level in levels:
-        picture = folder / "preview" / f"{level.stem.removeprefix('level-')}.png"
-        with open_artifact(level) as opened:
-            write_preview(opened, picture, wanted.product.name, wanted.product.version)
-        extra[f"preview/{picture.name}"] = picture
     steps.report("publishing")
     source = wanted.source.source
     return publish_release(

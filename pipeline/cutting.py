@@ -1,15 +1,19 @@
-"""Cutting all tiles of a release in a few processes: netCDF compresses on one thread each."""
+"""Cutting tiles and drawing previews in a few processes: netCDF compresses on one thread each."""
 
 from __future__ import annotations
 
 import concurrent.futures
 import concurrent.futures.process
+import contextlib
 import multiprocessing
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from magtiles.catalog.releases.lattice import Lattice
+from magtiles.pipeline.artifacts import open_artifact
+from magtiles.pipeline.preview import write_preview
 from magtiles.pipeline.progress import Progress
 from magtiles.pipeline.runner import run_stage
 from magtiles.schemas.errors import MagtilesError
@@ -23,34 +27,63 @@ _WORTH_PROCESSES = 4_000_000
 _Job = tuple[Sequence[Path], Path, Mapping[str, Any]]
 
 
-def cut_all(
-    lattice: Lattice, levels: Sequence[Path], folder: Path, progress: Progress
-) -> list[MeasuredTile]:
-    """Cut every tile of a lattice from its level grids into `folder`; read back and measured."""
-    rows, columns = lattice.shape
-    jobs: list[_Job] = [
-        (levels, folder / f"r{r:03d}c{c:03d}.nc", tiles.tile_params(lattice, r, c))
-        for r in range(rows)
-        for c in range(columns)
-    ]
-    done: list[MeasuredTile] = []
-    alone = lattice.rows * lattice.columns * len(levels) < _WORTH_PROCESSES
-    for tile in _in_turn(jobs) if alone else _in_processes(jobs):
-        done.append(tile)
-        progress("cutting tiles", len(done), len(jobs))
-    return done
+@contextlib.contextmanager
+def cutting(lattice: Lattice, levels: int) -> Iterator[Cutter]:
+    """A cutter for a lattice of so many levels; its processes start now and are ready when asked.
 
-
-def _in_turn(jobs: Sequence[_Job]) -> Iterator[MeasuredTile]:
-    yield from (_cut_one(*job) for job in jobs)
-
-
-def _in_processes(jobs: Sequence[_Job]) -> Iterator[MeasuredTile]:
+    Small releases are cut in this process.
+    """
+    if lattice.rows * lattice.columns * levels < _WORTH_PROCESSES:
+        yield Cutter(lattice, None)
+        return
     # Spawned, not forked: the threads of FFT and numba do not survive a fork.
     context = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(_PROCESSES, mp_context=context) as pool:
+        for _ in range(_PROCESSES):
+            pool.submit(_start)
+        yield Cutter(lattice, pool)
+
+
+@dataclass(frozen=True)
+class Cutter:
+    """Cuts the tiles of a lattice, in the processes of `pool` if there is one."""
+
+    lattice: Lattice
+    pool: concurrent.futures.Executor | None
+    pictures: list[concurrent.futures.Future[None]] = field(default_factory=list)
+
+    def cut(self, levels: Sequence[Path], folder: Path, progress: Progress) -> list[MeasuredTile]:
+        """Cut every tile from the level grids into `folder`, measured."""
+        rows, columns = self.lattice.shape
+        jobs: list[_Job] = [
+            (levels, folder / f"r{r:03d}c{c:03d}.nc", tiles.tile_params(self.lattice, r, c))
+            for r in range(rows)
+            for c in range(columns)
+        ]
+        done: list[MeasuredTile] = []
+        for tile in self._run(jobs):
+            done.append(tile)
+            progress("cutting tiles", len(done), len(jobs))
+        return done
+
+    def draw(self, level: Path, picture: Path, product: str, version: str) -> None:
+        """Draw the preview of a level, while the next one is made if there are processes."""
+        if self.pool is None:
+            _draw(level, picture, product, version)
+        else:
+            self.pictures.append(self.pool.submit(_draw, level, picture, product, version))
+
+    def finish_drawing(self) -> None:
+        """Wait until all pictures are there; raises what drawing one raised."""
+        for picture in self.pictures:
+            picture.result()
+
+    def _run(self, jobs: Sequence[_Job]) -> Iterator[MeasuredTile]:
+        if self.pool is None:
+            yield from (_cut_one(*job) for job in jobs)
+            return
         try:
-            yield from pool.map(_cut_one, *zip(*jobs, strict=True))
+            yield from self.pool.map(_cut_one, *zip(*jobs, strict=True))
         except concurrent.futures.process.BrokenProcessPool as caught:
             raise MagtilesError(
                 "a process that cuts tiles died",
@@ -59,5 +92,15 @@ def _in_processes(jobs: Sequence[_Job]) -> Iterator[MeasuredTile]:
             ) from caught
 
 
+def _start() -> None:
+    """Nothing: a process that can run this has loaded what cutting needs."""
+
+
 def _cut_one(levels: Sequence[Path], out: Path, params: Mapping[str, Any]) -> MeasuredTile:
-    return measure_tile(run_stage(tiles.STAGE, {"grid": levels}, out, params).out)
+    made = run_stage(tiles.STAGE, {"grid": levels}, out, params)
+    return measure_tile(made.out, made.dataset)
+
+
+def _draw(level: Path, picture: Path, product: str, version: str) -> None:
+    with open_artifact(level) as opened:
+        write_preview(opened, picture, product, version)

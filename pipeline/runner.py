@@ -26,11 +26,15 @@ _checked: set[tuple[str, str]] = set()
 
 @dataclass(frozen=True)
 class StageResult:
-    """What `run_stage` did: the artifact, whether it was made now, and why (not)."""
+    """What `run_stage` did: the artifact, whether it was made now, and why (not).
+
+    `dataset` is what was written, where it was made now.
+    """
 
     out: Path
     rebuilt: bool
     reason: str
+    dataset: xr.Dataset | None = None
 
 
 def run_stage(
@@ -62,20 +66,21 @@ def run_stage(
         _LOG.info("%s: %s is up to date", stage.name, out)
         return StageResult(out, rebuilt=False, reason="up to date")
     _LOG.info("%s: making %s (%s)", stage.name, out, reason)
-    _make(stage, parsed, paths, out)
+    dataset = _make(stage, parsed, paths, out)
     receipts.write_receipt(out, made_from, contracts.resolve(stage.output))
-    return StageResult(out, rebuilt=True, reason=reason)
+    return StageResult(out, rebuilt=True, reason=reason, dataset=dataset)
 
 
-def _make(stage: Stage, params: Params, paths: Mapping[str, list[Path]], out: Path) -> None:
+def _make(stage: Stage, params: Params, paths: Mapping[str, list[Path]], out: Path) -> xr.Dataset:
     with contextlib.ExitStack() as opened:
         arguments = {
             role: _argument(stage.inputs[role], role, files, opened)
             for role, files in paths.items()
         }
-        result = stage.run(**arguments, params=params)
+        result: xr.Dataset = stage.run(**arguments, params=params)
         contracts.check(result, stage.output, where=f"output of stage {stage.name}")
         write_artifact(result, out, stage.output)
+        return result
 
 
 def _argument(

@@ -14,7 +14,9 @@ from magtiles.stages.crs import WGS84
 from magtiles.stages.declare import Params, Stage, quantity
 from magtiles.stages.field.direction import Ambient, AmbientSource
 from magtiles.stages.field.interpolate import evaluate_linear, evaluate_spline
+from magtiles.stages.field.padding import plan_padding
 from magtiles.stages.field.prepare import PlaneMap, prepare
+from magtiles.stages.field.reuse import content_key, latest
 from magtiles.stages.field.rotation import rotate_to_ned
 from magtiles.stages.field.solve import AnomalousField, solve
 from magtiles.stages.field.spectral import (
@@ -81,14 +83,18 @@ def derive_components(grid: xr.Dataset, *, params: DeriveComponentsParams) -> xr
     permission, ParameterError when only one of two angles or axes is given.
     """
     _permit(grid, params)
-    plane_map = prepare(grid)
+    key = content_key(grid)
+    plane_map = latest("plane map", key, lambda: prepare(grid))
     ambient = AmbientSource(grid, params.inclination_deg, params.declination_deg)
-    field = solve(plane_map, ambient, params.height_m)
+    angles = params.inclination_deg, params.declination_deg
+    padding = plan_padding(plane_map.values.shape, plane_map.spacing, params.height_m)
+    field = latest("field", (key, angles, padding), lambda: solve(plane_map, ambient, padding))
     if params.latitude is not None and params.longitude is not None:
         target = geographic_target(params.latitude, params.longitude)
     else:
         target = own_target(grid, plane_map)
-    nodes = locate(target, plane_map, ambient)
+    axes = params.latitude, params.longitude
+    nodes = latest("nodes", (key, angles, axes), lambda: locate(target, plane_map, ambient))
     products = evaluate_products(field, nodes, params.height_m)
     sigmas = uncertainty(grid, plane_map, field, params.height_m, nodes.row, nodes.column)
     flags = quality_flags(plane_map, nodes, params.height_m)

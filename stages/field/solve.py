@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit, prange
 
 from magtiles.stages.field.direction import AmbientSource
-from magtiles.stages.field.padding import Padding, pad, plan_padding
+from magtiles.stages.field.padding import Padding, pad
 from magtiles.stages.field.plane import STEP_M, Plane, coarse_axis
 from magtiles.stages.field.prepare import PlaneMap
 from magtiles.stages.field.product import Level, Single
@@ -75,11 +75,9 @@ def plane_direction(plane: Plane, ambient: AmbientSource) -> Callable[[Real, Rea
     return direction
 
 
-def solve(plane_map: PlaneMap, ambient: AmbientSource, height_gain: float) -> AnomalousField:
-    """The anomalous field of a map, ready to be continued by `height_gain` (m)."""
-    spacing = plane_map.spacing
-    padding = plan_padding(plane_map.values.shape, spacing, height_gain)
-    wavenumbers = Wavenumbers(padding.shape, spacing)
+def solve(plane_map: PlaneMap, ambient: AmbientSource, padding: Padding) -> AnomalousField:
+    """The anomalous field of a map, ready to be continued as far as `padding` was planned for."""
+    wavenumbers = Wavenumbers(padding.shape, plane_map.spacing)
     directions = _coarse_directions(plane_map, ambient)
     mean = np.array([part.mean() for part in directions])
     mean /= np.linalg.norm(mean)

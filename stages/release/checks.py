@@ -18,8 +18,8 @@ FORMAT = "release-checks/1.0.0"
 TOLERANCE = 1e-6
 """Relative to 1 nT, 1 nT/km or the answer, whichever is larger."""
 
-_POINTS_PER_TILE = 12
-_TILES = 8
+_POINTS_PER_TILE = 24
+_TILES = 4
 _UNITS = {
     "total": "nT",
     "total_gradient": "nT km-1",

@@ -10,6 +10,7 @@ import re
 import shutil
 import socket
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -233,8 +234,10 @@ def _build(
     staging = home / f"{_STAGING}{socket.gethostname()}.{os.getpid()}"
     staging.mkdir()
     try:
-        for tile in tiles:
-            _copy(tile, staging)
+        (staging / "tiles").mkdir()
+        with ThreadPoolExecutor(2) as threads:
+            for _ in threads.map(lambda tile: _copy(tile, staging), tiles):
+                pass
         for path, data in files.items():
             (staging / path).parent.mkdir(exist_ok=True)
             (staging / path).write_bytes(data)
@@ -252,9 +255,7 @@ def _copy(tile: MeasuredTile, staging: Path) -> None:
     data = tile.source.read_bytes()
     if sha256(data) != tile.entry["sha256"]:
         raise ContractError("changed while it was being published", where=tile.source)
-    target = staging / str(tile.entry["path"])
-    target.parent.mkdir(exist_ok=True)
-    target.write_bytes(data)
+    (staging / str(tile.entry["path"])).write_bytes(data)
 
 
 def _complete(staging: Path, document: dict[str, Any]) -> None:

@@ -34,15 +34,17 @@ class MeasuredTile:
     heights: tuple[float, ...]
 
 
-def measure_tile(path: Path) -> MeasuredTile:
-    """Read a tile whole, check its contract, and digest it. ContractError or FormatError."""
+def measure_tile(path: Path, written: xr.Dataset | None = None) -> MeasuredTile:
+    """Digest a tile and measure what it holds. ContractError or FormatError.
+
+    The file is read back and checked, unless its dataset is given as it was `written` by a
+    caller who had checked it. Whether file and arrays agree is then for validation to see.
+    """
     try:
         data = path.read_bytes()
-        with xr.open_dataset(path, engine="netcdf4", decode_cf=False) as lazy:
-            dataset = lazy.load()
+        dataset = _read_back(path) if written is None else written
     except (OSError, ValueError) as caught:
         raise FormatError(f"is no readable tile: {caught}", where=path) from None
-    contracts.check(dataset, CONTRACT, where=path)
     attributes = dataset.attrs
     row, column = int(attributes["tile_row"]), int(attributes["tile_column"])
     arrays = {str(name): np.asarray(v.values) for name, v in dataset.variables.items()}
@@ -65,6 +67,13 @@ def measure_tile(path: Path) -> MeasuredTile:
         longitude=arrays["longitude"],
         heights=tuple(arrays["height"].tolist()),
     )
+
+
+def _read_back(path: Path) -> xr.Dataset:
+    with xr.open_dataset(path, engine="netcdf4", decode_cf=False) as lazy:
+        dataset = lazy.load()
+    contracts.check(dataset, CONTRACT, where=path)
+    return dataset
 
 
 def _statistics(dataset: xr.Dataset) -> dict[str, dict[str, list[float]]]:

@@ -60,7 +60,8 @@ def example() -> xr.Dataset:
 
 def nine_products(plane_map: PlaneMap, ambient: AmbientSource) -> list[NDArray[np.float32]]:
     """What is measured: all products of one level on the map's own nodes."""
-    field = solve(plane_map, ambient, GAIN_M)
+    padding = plan_padding(plane_map.values.shape, plane_map.spacing, GAIN_M)
+    field = solve(plane_map, ambient, padding)
     level = field.level(GAIN_M)
     return [level.values(p, *field.padding.interior) for p in ("total", *VECTOR, *TENSOR)]
 
