@@ -35,11 +35,17 @@ COMMANDS: tuple[ModuleType, ...] = (build, validate, info, query, plot, sample, 
 BAD_DATA, BAD_USE, INTERRUPTED, BROKEN_PIPE = 1, 2, 130, 141
 
 _EXTRA = (
+    "cdflib",
+    "google.protobuf",
+    "h5py",
     "jsonschema",
     "matplotlib",
+    "mcap",
+    "pandas",
     "ppigrf",
     "pydantic",
     "pyproj",
+    "pyulog",
     "rasterio",
     "rich",
     "scipy",
@@ -144,7 +150,14 @@ def _shield(word: str) -> str:
 
 
 def _has_extra() -> bool:
-    return all(importlib.util.find_spec(name) is not None for name in _EXTRA)
+    return all(_is_there(name) for name in _EXTRA)
+
+
+def _is_there(name: str) -> bool:
+    try:
+        return importlib.util.find_spec(name) is not None
+    except ModuleNotFoundError:  # the package that `name` is in
+        return False
 
 
 @contextlib.contextmanager

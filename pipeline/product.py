@@ -11,7 +11,13 @@ import pydantic
 
 from magtiles.schemas.errors import SourceError
 from magtiles.stages.declare import Params, parse_params, quantity
-from magtiles.stages.ingest.source import Source, load_source, load_toml
+from magtiles.stages.ingest.source import (
+    ANOMALY_GRID,
+    IngestGridParams,
+    Source,
+    load_source,
+    load_toml,
+)
 
 _LOWEST_M, _HIGHEST_M = -12_000.0, 100_000.0
 """From the deepest sea to where a map of one survey's plane ends to be one of the round Earth."""
@@ -111,7 +117,7 @@ class Product:
     product: ProductTable
     anomaly: AnomalyTable
     source_path: Path
-    source: Source
+    source: Source[IngestGridParams]
 
 
 def load_product(path: Path) -> Product:
@@ -123,7 +129,7 @@ def load_product(path: Path) -> Product:
         ProductTables, load_toml(path), where=path, error=SourceError
     )
     source_path = _find_source(tables.anomaly.source, path)
-    source = load_source(source_path)
+    source = load_source(source_path, ANOMALY_GRID)
     _check_reference(tables.anomaly, source, path)
     return Product(path, tables.product, tables.anomaly, source_path, source)
 
@@ -150,8 +156,8 @@ def _find_source(name: str, product: Path) -> Path:
     )
 
 
-def _check_reference(anomaly: AnomalyTable, source: Source, path: Path) -> None:
-    stated = source.grid.height_reference
+def _check_reference(anomaly: AnomalyTable, source: Source[IngestGridParams], path: Path) -> None:
+    stated = source.params.height_reference
     if stated is not None and stated != anomaly.height_reference:
         raise SourceError(
             f"height_reference is '{anomaly.height_reference}'",

@@ -16,7 +16,7 @@ from magtiles.pipeline.artifacts import check_artifact, open_artifact, write_art
 from magtiles.schemas import contracts
 from magtiles.schemas.errors import FormatError, UsageError
 from magtiles.stages.declare import FILES, OPTIONAL_FILE, Many, Params, Stage, parse_params
-from magtiles.stages.ingest.source import load_source
+from magtiles.stages.ingest.source import load_header, source_files
 
 _LOG = logging.getLogger(__name__)
 
@@ -144,7 +144,9 @@ def _with_data_files(stage: Stage, paths: Mapping[str, list[Path]]) -> dict[str,
         given = {path.name for path in paths[role]}
         for toml in (path for path in paths[role] if path.suffix.lower() == ".toml"):
             # A file given beside its TOML stands in for the TOML's own of that name.
-            named = [file for file in load_source(toml).files if file.name not in given]
+            named = [
+                file for file in source_files(toml, load_header(toml)) if file.name not in given
+            ]
             for file in named:
                 if not file.is_file():
                     raise FormatError(

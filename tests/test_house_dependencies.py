@@ -34,7 +34,7 @@ LOCKED = {
 PERMISSIVE = {
     "0BSD", "Apache-2.0", "Apache-2.0 WITH LLVM-exception", "BSD-2-Clause", "BSD-3-Clause",
     "CC0-1.0", "ISC", "MIT", "MIT-CMU", "PSF-2.0", "Zlib",
-    "Apache 2.0", "BSD", "New BSD", "BSD 3-Clause License",
+    "Apache 2.0", "BSD", "New BSD", "BSD 3-Clause License", "3-Clause BSD License", "MIT License",
     "OSI Approved :: Apache Software License", "OSI Approved :: BSD License",
     "OSI Approved :: MIT License", "OSI Approved :: Python Software Foundation License",
 }  # fmt: skip
@@ -60,9 +60,10 @@ def stated_licences(package: metadata.PackageMetadata) -> list[str]:
         for classifier in package.get_all("Classifier", [])
         if classifier.startswith("License :: ")
     ]
-    name = (package.get("License") or "").strip()
-    # Some put the whole text there; the classifier then has to do.
-    return [*stated, name] if name and "\n" not in name else stated
+    text = (package.get("License") or "").strip()
+    # Some put the whole text there: its first line is a name only where nothing else is said.
+    name, _, rest = text.partition("\n")
+    return [*stated, name] if name and not (rest and stated) else stated
 
 
 INSTALLED_HERE = [
@@ -117,5 +118,6 @@ def test_everything_in_the_lock_is_hashed() -> None:
 def test_the_command_line_asks_for_the_whole_extra() -> None:
     from magtiles.pipeline import main
 
-    imported = {requirement.name for requirement in EXTRA}
+    named_otherwise = {"protobuf": "google.protobuf"}
+    imported = {named_otherwise.get(r.name, r.name) for r in EXTRA}
     assert set(main._EXTRA) == imported

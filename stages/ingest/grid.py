@@ -24,6 +24,7 @@ from magtiles.stages.ingest.geotiff import read_geotiff
 from magtiles.stages.ingest.gxf import read_gxf
 from magtiles.stages.ingest.raw import RawGrid, nanotesla_per, refuse_infinite
 from magtiles.stages.ingest.source import (
+    ANOMALY_GRID,
     TOTAL_FIELD_ANOMALY,
     IngestGridParams,
     Source,
@@ -62,7 +63,7 @@ def ingest_grid(files: Sequence[Path], *, params: IngestGridParams) -> xr.Datase
     SourceError : a key is missing, unknown, or contradicts the file; the datum is not known.
     IntegrityError : the file's digest is not the one its source states.
     """
-    path, source = locate([Path(f) for f in files])
+    path, source = locate([Path(f) for f in files], ANOMALY_GRID)
     where = str(path) if source is None else f"{source.path} [grid]"
     params = merge(params, source)
     raw = _READERS[sniff(path)](path, params)
@@ -102,7 +103,7 @@ class _Grid:
     crs: pyproj.CRS
 
 
-def _name(path: Path, source: Source | None) -> str:
+def _name(path: Path, source: Source[IngestGridParams] | None) -> str:
     return path.name if source is None else source.source.id
 
 

@@ -7,7 +7,7 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Generic, Literal, TypeVar
 
 import pydantic
 
@@ -84,44 +84,83 @@ class SourceParams(Params):
     sha256: dict[str, str] = quantity("1", default={}, doc="Digest of each file, by its name.")
 
 
+P = TypeVar("P", bound=Params)
+
+
 @dataclass(frozen=True)
-class Source:
-    """A source TOML, read: its own path, the [source] table and the raw table of its kind."""
+class SourceKind(Generic[P]):
+    """A kind of source: its contract's name and the table that its files need beside [source]."""
+
+    name: str
+    table: str
+    params: type[P]
+
+
+ANOMALY_GRID = SourceKind("anomaly-grid", "grid", IngestGridParams)
+
+
+@dataclass(frozen=True)
+class Source(Generic[P]):
+    """A source TOML, read: its own path, the [source] table and the table of its kind."""
 
     path: Path
+    kind: SourceKind[P]
     source: SourceParams
-    grid: IngestGridParams
+    params: P
 
     @property
     def files(self) -> tuple[Path, ...]:
         """Paths of the data files, beside the TOML."""
-        return tuple(self.path.parent / name for name in self.source.files)
+        return source_files(self.path, self.source)
 
 
-def load_source(path: Path) -> Source:
-    """Read a source TOML of kind ``anomaly-grid``.
+def source_files(path: Path, header: SourceParams) -> tuple[Path, ...]:
+    """Paths of the data files that the source TOML at `path` names, beside it."""
+    return tuple(path.parent / name for name in header.files)
+
+
+def load_header(path: Path) -> SourceParams:
+    """The [source] table of a source TOML of any kind.
+
+    Raises SourceError that names the file and the key.
+    """
+    return _header(path, load_toml(path))
+
+
+def load_source(path: Path, kind: SourceKind[P]) -> Source[P]:
+    """Read a source TOML of one kind.
 
     Raises SourceError that names the file and the table's key.
     """
     tables = load_toml(path)
+    header = _header(path, tables)
+    if header.kind != kind.name:
+        raise SourceError(
+            f"key 'kind' is '{header.kind}'",
+            where=f"{path} [source]",
+            expected=f"'{kind.name}'",
+        )
     for name in tables:
-        if name not in ("source", "grid"):
-            raise SourceError(f"unknown table [{name}]", where=path, expected="[source], [grid]")
+        if name not in ("source", kind.table):
+            raise SourceError(
+                f"unknown table [{name}]", where=path, expected=f"[source], [{kind.table}]"
+            )
+    params: P = parse_params(
+        kind.params,
+        tables.get(kind.table, {}),
+        where=f"{path} [{kind.table}]",
+        error=SourceError,
+    )
+    return Source(path, kind, header, params)
+
+
+def _header(path: Path, tables: dict[str, dict[str, Any]]) -> SourceParams:
     if "source" not in tables:
         raise SourceError("table [source] is missing", where=path, remedy="add it")
     header: SourceParams = parse_params(
         SourceParams, tables["source"], where=f"{path} [source]", error=SourceError
     )
-    if header.kind != "anomaly-grid":
-        raise SourceError(
-            f"key 'kind' is '{header.kind}'",
-            where=f"{path} [source]",
-            expected="'anomaly-grid'",
-        )
-    grid: IngestGridParams = parse_params(
-        IngestGridParams, tables.get("grid", {}), where=f"{path} [grid]", error=SourceError
-    )
-    return Source(path, header, grid)
+    return header
 
 
 def load_toml(path: Path) -> dict[str, dict[str, Any]]:
@@ -144,65 +183,76 @@ def load_toml(path: Path) -> dict[str, dict[str, Any]]:
     return document
 
 
-def locate(files: Sequence[Path]) -> tuple[Path, Source | None]:
-    """The one data file that `files` name, and the source TOML that describes it, if any.
+def locate_all(files: Sequence[Path], kind: SourceKind[P]) -> tuple[list[Path], Source[P] | None]:
+    """The data files that `files` name, and the source TOML that describes them, if any.
 
     A data file given beside a TOML stands in for the TOML's file of the same name, so that a
-    local copy can be used. Raises SourceError for none or several, IntegrityError when the
-    digest is not the one stated.
+    local copy can be used. Raises SourceError for several TOMLs, none or unknown files;
+    IntegrityError when a digest is not the one stated.
     """
     tomls = [p for p in files if p.suffix.lower() == ".toml"]
-    given = {p.name: p for p in files if p.suffix.lower() != ".toml"}
+    direct = [p for p in files if p.suffix.lower() != ".toml"]
     if len(tomls) > 1:
         raise SourceError(f"{len(tomls)} source TOMLs", expected="one", where=tomls[1])
-    source = load_source(tomls[0]) if tomls else None
-    named = {p.name: p for p in source.files} if source else {}
-    stray = sorted(set(given) - set(named)) if source else []
-    if stray:
+    if not tomls:
+        if not direct:
+            raise SourceError("no data file", where="files", remedy="name one")
+        return direct, None
+    source = load_source(tomls[0], kind)
+    named, given = {p.name: p for p in source.files}, {p.name: p for p in direct}
+    for stray in sorted(set(given) - set(named)):
         raise SourceError(
-            f"does not name the data file '{stray[0]}' given beside it",
+            f"does not name the data file '{stray}' given beside it",
             where=f"{tomls[0]} [source] files",
             expected=f"one of {', '.join(named)}",
         )
-    data = named | given
-    if len(data) != 1:
+    found = list((named | given).values())
+    for path in found:
+        _check_digest(path, source.source, tomls[0])
+    return found, source
+
+
+def locate(files: Sequence[Path], kind: SourceKind[P]) -> tuple[Path, Source[P] | None]:
+    """The one data file that `files` name, and its source TOML: see `locate_all`.
+
+    Raises SourceError for several files too.
+    """
+    found, source = locate_all(files, kind)
+    if len(found) != 1:
         raise SourceError(
-            f"{len(data)} data files: {', '.join(sorted(data)) or 'none'}",
+            f"{len(found)} data files: {', '.join(sorted(p.name for p in found))}",
             where="files",
-            expected="one grid file",
-            remedy="ingest each grid alone",
+            expected="one file",
+            remedy="ingest each alone",
         )
-    path = next(iter(data.values()))
-    if source is not None:
-        _check_digest(path, source)
-    return path, source
+    return found[0], source
 
 
-def merge(params: IngestGridParams, source: Source | None) -> IngestGridParams:
-    """The [grid] keys of a source together with parameters given directly.
+def merge(params: P, source: Source[P] | None) -> P:
+    """The keys of a source's own table together with parameters given directly.
 
     Raises SourceError where both state a key differently.
     """
     if source is None:
         return params
-    stated = _stated(source.grid)
+    stated = _stated(source.params)
     for key, value in _stated(params).items():
         if stated.setdefault(key, value) != value:
             raise SourceError(
                 f"key '{key}' is {stated[key]!r}, but the parameter says {value!r}",
-                where=f"{source.path} [grid]",
+                where=f"{source.path} [{source.kind.table}]",
                 remedy="state it once",
             )
-    return IngestGridParams(**stated)
+    return type(params)(**stated)
 
 
-def _stated(params: IngestGridParams) -> dict[str, Any]:
+def _stated(params: Params) -> dict[str, Any]:
     values: Mapping[str, Any] = {name: getattr(params, name) for name in params.model_fields_set}
     return {k: v for k, v in values.items() if v is not None}
 
 
-def _check_digest(path: Path, source: Source) -> None:
-    expected = source.source.sha256.get(path.name)
+def _check_digest(path: Path, header: SourceParams, toml: Path) -> None:
+    expected = header.sha256.get(path.name)
     if expected is None or not path.is_file():
         return
     with path.open("rb") as file:
@@ -211,6 +261,6 @@ def _check_digest(path: Path, source: Source) -> None:
         raise IntegrityError(
             f"sha256 is {found}",
             where=path,
-            expected=f"{expected} as {source.path.name} states",
+            expected=f"{expected} as {toml.name} states",
             remedy="fetch the file again, or correct the digest if the data set was replaced",
         )

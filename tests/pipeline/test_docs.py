@@ -17,7 +17,7 @@ from magtiles.pipeline.product import AnomalyTable, ProductTable, ProductTables,
 from magtiles.pipeline.sample import DEMO, synthesize, write_survey
 from magtiles.schemas import contracts
 from magtiles.stages.declare import Params, parse_params
-from magtiles.stages.ingest.source import IngestGridParams, SourceParams, load_source
+from magtiles.stages.ingest.source import ANOMALY_GRID, IngestGridParams, SourceParams, load_source
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -82,7 +82,7 @@ def test_toml_examples_are_valid(page: Path, found: list[str], tmp_path: Path) -
         tables = tomllib.loads(block)
         if "source" in tables:
             (tmp_path / "source.toml").write_text(block)
-            assert load_source(tmp_path / "source.toml").source.licence
+            assert load_source(tmp_path / "source.toml", ANOMALY_GRID).source.licence
         else:
             assert parse_params(ProductTables, tables, where=page).anomaly.heights_m
 
