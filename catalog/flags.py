@@ -1,4 +1,4 @@
-"""The bits of `quality_flag`, the same in every grid and tile."""
+"""The bits of `quality_flag`: of grids and tiles, of observatory records, and of tracks."""
 
 from __future__ import annotations
 
@@ -18,10 +18,44 @@ class QualityFlag(enum.IntFlag):
     REDUCED_ACCURACY_DIRECTION = 16
 
 
-def flag_attributes() -> dict[str, Any]:
+class RecordFlag(enum.IntFlag):
+    """What is wrong, or said to be, with a sample of an observatory's record (uint8)."""
+
+    MISSING_MARK = 1
+    SPIKE = 2
+    STEP = 4
+    STUCK = 8
+    TOTAL_MISMATCH = 16
+    LEVEL_MISMATCH = 32
+    INCOMPLETE_AVERAGE = 64
+    OVERLAP_RESOLVED = 128
+
+
+UNFIT_RECORD = RecordFlag.SPIKE | RecordFlag.STUCK | RecordFlag.TOTAL_MISMATCH
+"""Samples that carry one of these are left out of baselines and statistics."""
+
+
+class TrackFlag(enum.IntFlag):
+    """What is doubtful of a sample of a track (uint16)."""
+
+    NO_FIX = 1
+    FIX_OUTLIER = 2
+    POSITION_GAP = 4
+    STATIONARY = 8
+    FIELD_GAP = 16
+    FIELD_SPIKE = 32
+    MANOEUVRE = 64
+    NO_DIURNAL = 128
+    CLOCK_STEP = 256
+    EXTRAPOLATED_CALIBRATION = 512
+
+
+def flag_attributes(
+    flags: type[enum.IntFlag] = QualityFlag, dtype: type[np.unsignedinteger[Any]] = np.uint8
+) -> dict[str, Any]:
     """CF attributes of a quality_flag variable."""
     return {
         "long_name": "why a value is filled or doubtful",
-        "flag_masks": np.array([flag.value for flag in QualityFlag], dtype=np.uint8),
-        "flag_meanings": " ".join(str(flag.name).lower() for flag in QualityFlag),
+        "flag_masks": np.array([flag.value for flag in flags], dtype=dtype),
+        "flag_meanings": " ".join(str(flag.name).lower() for flag in flags),
     }
