@@ -1,0 +1,1 @@
+"""Records of geomagnetic observatories, and indices of activity, from their exchange formats."""

@@ -1,0 +1,1 @@
+"""Observatory records: their quality, quiet days and statistics in time."""
