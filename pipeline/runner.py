@@ -15,7 +15,15 @@ from magtiles.pipeline import receipts
 from magtiles.pipeline.artifacts import check_artifact, open_artifact, write_artifact
 from magtiles.schemas import contracts
 from magtiles.schemas.errors import FormatError, UsageError
-from magtiles.stages.declare import FILES, OPTIONAL_FILE, Many, Params, Stage, parse_params
+from magtiles.stages.declare import (
+    FILES,
+    OPTIONAL_FILE,
+    Many,
+    OptionalInput,
+    Params,
+    Stage,
+    parse_params,
+)
 from magtiles.stages.ingest.source import load_header, source_files
 
 _LOG = logging.getLogger(__name__)
@@ -84,13 +92,13 @@ def _make(stage: Stage, params: Params, paths: Mapping[str, list[Path]], out: Pa
 
 
 def _argument(
-    kind: str | Many, role: str, files: list[Path], opened: contextlib.ExitStack
+    kind: str | Many | OptionalInput, role: str, files: list[Path], opened: contextlib.ExitStack
 ) -> Path | list[Path] | list[xr.Dataset] | xr.Dataset:
     if kind == FILES:
         return files
     if kind == OPTIONAL_FILE:
         return files[0]
-    contract = kind.contract if isinstance(kind, Many) else kind
+    contract = kind if isinstance(kind, str) else kind.contract
     datasets = []
     for path in files:
         _check_input(path, contracts.resolve(contract), role)
@@ -118,7 +126,7 @@ def _paths_by_role(
     for role, kind in stage.inputs.items():
         given = inputs.get(role, ())
         files = [given] if isinstance(given, Path) else list(given)
-        if not files and kind == OPTIONAL_FILE:
+        if not files and (kind == OPTIONAL_FILE or isinstance(kind, OptionalInput)):
             continue
         if not files:
             raise UsageError(f"no file for role '{role}'", where=where, remedy=f"give {role}=FILE")

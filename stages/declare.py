@@ -68,6 +68,13 @@ class Many:
 
 
 @dataclass(frozen=True)
+class OptionalInput:
+    """An input role that takes a dataset of a contract where it is given, none where not."""
+
+    contract: str
+
+
+@dataclass(frozen=True)
 class Stage:
     """A step of the pipeline, declared.
 
@@ -76,8 +83,9 @@ class Stage:
     name : the name on the command line and in receipts.
     version : raised whenever the same inputs would give other output.
     params : the class of its parameters.
-    inputs : role to contract; `Many(contract)` for several, `FILES` for foreign files,
-        `OPTIONAL_FILE` for one that may be left out. Stages of one name differ in their roles.
+    inputs : role to contract; `Many(contract)` for several, `OptionalInput(contract)` for one
+        that may be left out, `FILES` for foreign files, `OPTIONAL_FILE` for one that may be
+        left out. Stages of one name differ in their roles.
     output : contract of what `run` returns.
     run : called with one keyword per role and ``params``; does no I/O outside ``ingest``.
     """
@@ -85,7 +93,7 @@ class Stage:
     name: str
     version: int
     params: type[Params]
-    inputs: Mapping[str, str | Many]
+    inputs: Mapping[str, str | Many | OptionalInput]
     output: str
     run: Callable[..., xr.Dataset]
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from magtiles.pipeline.output import print_json
 
 if TYPE_CHECKING:
-    from magtiles.stages.declare import Many, Stage
+    from magtiles.stages.declare import Many, OptionalInput, Stage
 
 HELP = "list the stages with their roles, contracts and parameters"
 NEEDS_PIPELINE = True
@@ -58,8 +58,12 @@ def _describe_params(stage: Stage) -> list[dict[str, Any]]:
     return described
 
 
-def _kind(kind: str | Many) -> str:
-    return kind if isinstance(kind, str) else f"{kind.contract} (one or more)"
+def _kind(kind: str | Many | OptionalInput) -> str:
+    from magtiles.stages.declare import Many
+
+    if isinstance(kind, str):
+        return kind
+    return f"{kind.contract} ({'one or more' if isinstance(kind, Many) else 'or none'})"
 
 
 def _line(parameter: dict[str, Any]) -> str:

@@ -59,7 +59,7 @@ def test_stages_are_told_apart_and_have_known_contracts() -> None:
     for stage in registry.STAGES:
         assert stage.version >= 1
         assert stage.run.__doc__, stage.name
-        kinds = [k.contract if isinstance(k, Many) else k for k in stage.inputs.values()]
+        kinds = [k if isinstance(k, str) else k.contract for k in stage.inputs.values()]
         for contract in [stage.output, *(k for k in kinds if k not in (FILES, OPTIONAL_FILE))]:
             contracts.resolve(contract)
         for name, field in stage.params.model_fields.items():

@@ -24,7 +24,7 @@ from magtiles.schemas.errors import (
     ParameterError,
     UsageError,
 )
-from magtiles.stages.declare import FILES, Many, Params, Stage, quantity
+from magtiles.stages.declare import FILES, Many, OptionalInput, Params, Stage, quantity
 
 GRID = "anomaly-grid/1"
 
@@ -89,6 +89,13 @@ def first(grids: list[xr.Dataset], *, params: NoParams) -> xr.Dataset:
 FIRST = Stage("first", 1, NoParams, {"grids": Many(GRID)}, GRID, first)
 
 
+def both(grid: xr.Dataset, other: xr.Dataset | None = None, *, params: NoParams) -> xr.Dataset:
+    return grid.copy() if other is None else other.copy()
+
+
+BOTH = Stage("both", 1, NoParams, {"grid": GRID, "other": OptionalInput(GRID)}, GRID, both)
+
+
 @pytest.fixture
 def source(tmp_path: Path) -> Path:
     write_artifact(grid(), tmp_path / "grid.nc", GRID)
@@ -111,6 +118,18 @@ def test_artifact_survives_the_disk_unchanged(source: Path) -> None:
         )  # values, NaN and coordinates, to the bit
         assert back["quality_flag"].attrs["flag_masks"].tolist() == [1]
         assert back["crs"].attrs["crs_wkt"] == pyproj.CRS(32613).to_wkt()
+
+
+def test_an_optional_dataset_is_passed_only_where_it_is_given(source: Path, tmp_path: Path) -> None:
+    twice = tmp_path / "twice.nc"
+    run_stage(SCALE, {"grid": source}, twice, {"factor": 2.0})
+    for given, same in ({}, source), ({"other": twice}, twice):
+        result = run_stage(BOTH, {"grid": source, **given}, tmp_path / "both.nc", {})
+        assert result.rebuilt
+        with open_artifact(result.out) as made, open_artifact(same) as expected:
+            xr.testing.assert_equal(made, expected)
+    with pytest.raises(UsageError, match="2 files for role 'other'; expected one"):
+        run_stage(BOTH, {"grid": source, "other": [twice, twice]}, tmp_path / "x.nc", {})
 
 
 def test_stage_runs_once_and_says_why_again(source: Path, tmp_path: Path) -> None:
