@@ -1,0 +1,1 @@
+"""What turns a raw log into a field that can be believed."""
