@@ -38,6 +38,7 @@ _EXTRA = (
     "cdflib",
     "google.protobuf",
     "h5py",
+    "harmonica",
     "jsonschema",
     "matplotlib",
     "mcap",

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pyproj.exceptions import CRSError
 
 from magtiles.schemas.errors import FormatError, SourceError
+from magtiles.stages.ingest.gmt_netcdf import is_old_gmt, read_old_gmt
 from magtiles.stages.ingest.raw import RawGrid, is_magnetic
 from magtiles.stages.ingest.source import IngestGridParams
 
@@ -41,7 +42,8 @@ def read_cf(path: Path, params: IngestGridParams) -> RawGrid:
     Raises FormatError for a damaged file, missing or curvilinear coordinates; SourceError
     where the variable is not clear.
     """
-    return _read(_load(path), path, params)
+    dataset = _load(path)
+    return (read_old_gmt if is_old_gmt(dataset) else _read)(dataset, path, params)
 
 
 def _load(path: Path) -> xr.Dataset:

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import BinaryIO
 
 from magtiles.schemas.errors import FormatError
+from magtiles.stages.ingest.geosoft import is_geosoft
+from magtiles.stages.ingest.xyz import is_xyz
 
 _MAGIC = {
     b"II*\x00": "geotiff",
@@ -16,10 +18,13 @@ _MAGIC = {
     b"\x89HDF": "netcdf",
     b"CDF\x01": "netcdf",
     b"CDF\x02": "netcdf",
+    b"DSAA": "surfer-6-text",
+    b"DSBB": "surfer-6",
+    b"DSRB": "surfer-7",
 }
 _KNOWN_OTHERS = {
-    b"PK\x03\x04": "a zip archive",
-    b"\x1f\x8b": "gzip-compressed",
+    b"PK\x03\x04": "a zip archive inside another archive",
+    b"\x1f\x8b": "gzip-compressed once more",
     b"\xfd7zXZ": "xz-compressed",
     b"%PDF": "a PDF document",
     b"\x89PNG": "a PNG picture",
@@ -28,7 +33,7 @@ _HEAD_BYTES = 65536
 
 
 def sniff(path: Path) -> str:
-    """``geotiff``, ``gxf`` or ``netcdf``, by content.
+    """What kind of grid a file is, by content: ``geotiff``, ``gxf``, ``netcdf``, ``geosoft``, ...
 
     Raises FormatError for a missing, empty or unreadable file, a folder, and other formats.
     """
@@ -52,11 +57,20 @@ def sniff(path: Path) -> str:
         b"#POINTS" in head.upper()
     ):
         return "gxf"
+    if head.lstrip().startswith(b"DatasetHeader Begin"):
+        return "er-mapper"
+    if head[:64].split()[:1] and head.split(maxsplit=1)[0].lower() in (b"ncols", b"nrows"):
+        return "esri-ascii"
+    if is_geosoft(head):
+        return "geosoft"
+    if is_xyz(head):
+        return "xyz"
     raise FormatError(
         f"is {_describe(head)}",
         where=f"{path} byte 0",
-        expected="GeoTIFF, GXF or netCDF",
-        remedy="unpack or convert it first",
+        expected="GeoTIFF, GXF, netCDF, Geosoft, Surfer, ER Mapper, ESRI ASCII, or rows of x, y "
+        "and value",
+        remedy="convert it first",
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,24 +21,30 @@ from magtiles.stages.declare import FILES, Stage
 from magtiles.stages.ingest.axes import regular_axis, wrapped_longitudes
 from magtiles.stages.ingest.cf_netcdf import read_cf
 from magtiles.stages.ingest.files import sniff
-from magtiles.stages.ingest.geotiff import read_geotiff
+from magtiles.stages.ingest.geosoft import read_geosoft
 from magtiles.stages.ingest.gxf import read_gxf
+from magtiles.stages.ingest.raster import KINDS as RASTERS
+from magtiles.stages.ingest.raster import read_raster
 from magtiles.stages.ingest.raw import RawGrid, nanotesla_per, refuse_infinite
 from magtiles.stages.ingest.source import (
     ANOMALY_GRID,
     TOTAL_FIELD_ANOMALY,
     IngestGridParams,
     Source,
-    locate,
+    locate_all,
     merge,
 )
+from magtiles.stages.ingest.unpack import unpacked
+from magtiles.stages.ingest.xyz import read_xyz
 
 _LOG = logging.getLogger(__name__)
 
 _READERS: dict[str, Callable[[Path, IngestGridParams], RawGrid]] = {
-    "geotiff": read_geotiff,
+    "geosoft": read_geosoft,
     "gxf": read_gxf,
     "netcdf": read_cf,
+    "xyz": read_xyz,
+    **{kind: functools.partial(read_raster, kind) for kind in RASTERS},
 }
 _NECESSARY = ("height_m", "height_reference", "reference_field", "reference_epoch")
 _CREDIBLE_NT = 1e5  # no crustal anomaly is larger; the whole field is about 25-65 thousand nT
@@ -54,7 +61,8 @@ def ingest_grid(files: Sequence[Path], *, params: IngestGridParams) -> xr.Datase
 
     Parameters
     ----------
-    files : the grid file (GeoTIFF, GXF or CF netCDF), its source TOML, or both.
+    files : the grid file in a format of `files.sniff`, plain or in gzip or zip; its source
+        TOML; or both. The data file of an ER Mapper header is named beside it.
     params : the [grid] keys of the TOML; either may state them.
 
     Raises
@@ -63,10 +71,11 @@ def ingest_grid(files: Sequence[Path], *, params: IngestGridParams) -> xr.Datase
     SourceError : a key is missing, unknown, or contradicts the file; the datum is not known.
     IntegrityError : the file's digest is not the one its source states.
     """
-    path, source = locate([Path(f) for f in files], ANOMALY_GRID)
+    found, source = locate_all([Path(f) for f in files], ANOMALY_GRID)
+    path = _header_of(found)
     where = str(path) if source is None else f"{source.path} [grid]"
     params = merge(params, source)
-    raw = _READERS[sniff(path)](path, params)
+    raw = _read(path, params)
     refuse_infinite(raw.values, where=path)
     facts = _Facts(_settle(raw, params, path, where), where, path.name)
     grid = _oriented(raw, facts)
@@ -81,6 +90,45 @@ STAGE = Stage(
     output="anomaly-grid/1",
     run=ingest_grid,
 )
+
+
+def _header_of(files: Sequence[Path]) -> Path:
+    """The one grid file, or the header of the two that an ER Mapper grid is."""
+    headers = [p for p in files if p.suffix.lower() == ".ers"]
+    if (
+        len(files) == 2
+        and headers
+        and files[1 - files.index(headers[0])] == headers[0].with_suffix("")
+    ):
+        return headers[0]
+    if len(files) != 1:
+        raise SourceError(
+            f"{len(files)} data files: {', '.join(sorted(p.name for p in files))}",
+            where="files",
+            expected="one grid file",
+            remedy="ingest each grid alone",
+        )
+    if headers:
+        raise SourceError(
+            "its data file is not named",
+            where=files[0],
+            expected=f"'{files[0].with_suffix('').name}' among the files too",
+        )
+    return files[0]
+
+
+def _read(path: Path, params: IngestGridParams) -> RawGrid:
+    with unpacked(path, params.member) as file:
+        try:
+            return _READERS[sniff(file)](file, params)
+        except (FormatError, SourceError) as caught:
+            if file == path:
+                raise
+            # The unpacked copy is gone when someone reads this: name the archive instead.
+            where = str(caught.where).replace(str(file), f"{path} ({file.name})")
+            raise type(caught)(
+                caught.what, where=where, expected=caught.expected, remedy=caught.remedy
+            ) from None
 
 
 @dataclass(frozen=True)

@@ -66,6 +66,15 @@ class IngestGridParams(Params):
     )
     band: int | None = quantity("1", default=None, ge=1, doc="Raster band, counted from 1.")
     variable: str | None = quantity("1", default=None, doc="Variable of a netCDF file.")
+    member: str | None = quantity(
+        "1", default=None, doc="File of a zip archive that holds several."
+    )
+    columns: tuple[int, int, int] = quantity(
+        "1", default=(1, 2, 3), doc="Columns of x, y and value of a text grid, counted from 1."
+    )
+    uncertainty_column: int | None = quantity(
+        "1", default=None, ge=1, doc="Column of a text grid with 1 sigma of the value."
+    )
     allow_ballpark_datum: bool = quantity(
         "1", default=False, doc="Accept a datum whose relation to WGS84 is not known."
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import tomllib
 from dataclasses import replace
@@ -95,8 +96,8 @@ def table_of(kind: type[Params]) -> str:
         unit = str(extra["unit"]) if isinstance(extra, dict) else "1"
         unit = "" if unit == "1" else unit
         default = "required" if field.is_required() else ""
-        if field.default is False:
-            default = "`false`"
+        elif field.default not in (None, {}):
+            default = f"`{json.dumps(field.default)}`"
         meaning = str(field.description).replace("|", r"\|")
         lines.append(f"| `{name}` | {unit} | {default} | {meaning} |")
     return "\n".join(lines)

@@ -149,8 +149,8 @@ _FILES = [
     Expect(
         "html", lambda f: _bytes(f / "a.tif", b"<!DOCTYPE html><p>404"), FormatError, "an HTML page"
     ),
-    Expect("zip", lambda f: _bytes(f / "a.tif", b"PK\x03\x04rest"), FormatError, "a zip archive"),
-    Expect("text", lambda f: _bytes(f / "a.tif", b"1 2 3\n"), FormatError, "text of an unknown"),
+    Expect("zip", lambda f: _bytes(f / "a.tif", b"PK\x03\x04rest"), FormatError, "whole zip file"),
+    Expect("text", lambda f: _bytes(f / "a.tif", b"one 2 3\n"), FormatError, "text of an unknown"),
     Expect("noise", lambda f: _bytes(f / "a.gxf", bytes(99)), FormatError, "binary data"),
     Expect(
         "tiff-header-only",

@@ -1,0 +1,185 @@
+"""Raster grids through rasterio (GDAL): GeoTIFF, Surfer 6 and 7, ER Mapper, ESRI ASCII.
+
+GDAL also reads what lies beside a file (world files, ``.prj``, ``.aux.xml``). Here it does not:
+what a grid is must not depend on files that no receipt knows of.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyproj
+import rasterio
+from numpy.typing import NDArray
+from rasterio.errors import NotGeoreferencedWarning, RasterioError
+from rasterio.io import MemoryFile
+
+from magtiles.schemas.errors import FormatError, SourceError
+from magtiles.stages.ingest.files import check_tiff_directories
+from magtiles.stages.ingest.raw import RawGrid
+from magtiles.stages.ingest.source import IngestGridParams
+
+_ALONE = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_PAM_ENABLED": "NO"}
+
+
+def _check_ers_data(path: Path) -> None:
+    """Raise FormatError unless an ER Mapper header's data file holds what the header says.
+
+    GDAL fills what a truncated data file lacks with zeros, and zero is a value.
+    """
+    header = path.read_text(encoding="latin-1")
+    data = path.with_suffix("")
+    if not data.is_file():
+        raise FormatError(
+            "its data file is missing",
+            where=path,
+            expected=f"'{data.name}' beside it",
+            remedy='name both in the source TOML: files = ["NAME.ers", "NAME"]',
+        )
+    cells = [_ers_number(header, key, path) for key in ("NrOfLines", "NrOfCellsPerLine")]
+    kind = re.search(r"CellType\s*=\s*(?:IEEE|Signed|Unsigned)(\d)Byte", header)
+    if kind is None:
+        raise FormatError("CellType is missing", where=path, expected="such as IEEE4ByteReal")
+    offset = _ers_number(header, "HeaderOffset", path, 0)
+    bands = _ers_number(header, "NrOfBands", path, 1)
+    wanted = offset + cells[0] * cells[1] * bands * int(kind[1])
+    if data.stat().st_size < wanted:
+        raise FormatError(
+            f"holds {data.stat().st_size} bytes",
+            where=data,
+            expected=f"{wanted}, as {path.name} says",
+            remedy="the file is truncated: fetch it again",
+        )
+
+
+def _ers_number(header: str, key: str, path: Path, default: int | None = None) -> int:
+    found = re.search(rf"\b{key}\s*=\s*(\d+)", header)
+    if found is None and default is None:
+        raise FormatError(f"{key} is missing", where=path, expected=f"{key} = a whole number")
+    return int(found[1]) if found else int(default or 0)
+
+
+@dataclass(frozen=True)
+class _Format:
+    """GDAL's driver, the name people know, and what to check before GDAL reads.
+
+    `from_memory`: the driver looks for sidecars whatever it is told.
+    """
+
+    driver: str
+    name: str
+    check: Callable[[Path], None] | None = None
+    from_memory: bool = False
+
+
+_FORMATS = {
+    "geotiff": _Format("GTiff", "GeoTIFF", check_tiff_directories),
+    "surfer-6-text": _Format("GSAG", "Surfer 6 text grid"),
+    "surfer-6": _Format("GSBG", "Surfer 6 grid"),
+    "surfer-7": _Format("GS7BG", "Surfer 7 grid"),
+    "er-mapper": _Format("ERS", "ER Mapper grid", _check_ers_data),
+    "esri-ascii": _Format("AAIGrid", "ESRI ASCII grid", from_memory=True),
+}
+KINDS = tuple(_FORMATS)
+"""What `files.sniff` calls the formats read here."""
+
+
+def read_raster(kind: str, path: Path, params: IngestGridParams) -> RawGrid:
+    """One band of a raster of one of `KINDS`, with its cell centres.
+
+    GDAL gives cell corners for either registration, so nodes are always the cells' centres.
+    Raises FormatError for truncated, rotated or unplaced rasters, SourceError where the band
+    is not clear.
+    """
+    form = _FORMATS[kind]
+    if form.check is not None:
+        form.check(path)
+    try:
+        with warnings.catch_warnings(), rasterio.Env(**_ALONE):
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            with _opened(path, form) as dataset:
+                return _read(dataset, path, params)
+    except RasterioError as caught:
+        detail = caught.__cause__ or caught
+        raise FormatError(
+            f"is not a whole {form.name}: {str(detail).replace(str(path), path.name)}",
+            where=path,
+            remedy="fetch it again",
+        ) from None
+
+
+@contextlib.contextmanager
+def _opened(path: Path, form: _Format) -> Iterator[Any]:
+    if not form.from_memory:
+        with rasterio.open(path, driver=form.driver) as dataset:
+            yield dataset
+        return
+    with MemoryFile(path.read_bytes()) as memory, memory.open(driver=form.driver) as dataset:
+        yield dataset
+
+
+def _read(dataset: Any, path: Path, params: IngestGridParams) -> RawGrid:
+    band = _choose_band(dataset, path, params.band)
+    x, y = _nodes(dataset, path)
+    stored = dataset.read(band, masked=True)
+    values = _scaled(stored, dataset.scales[band - 1], dataset.offsets[band - 1])
+    says: dict[str, Any] = {}
+    if dataset.driver == "GTiff":
+        point = dataset.tags().get("AREA_OR_POINT") == "Point"
+        says["registration"] = "point" if point else "pixel"
+    if dataset.units[band - 1]:
+        says["units"] = dataset.units[band - 1]
+    if dataset.nodatavals[band - 1] is not None and np.isfinite(dataset.nodatavals[band - 1]):
+        says["no_data"] = float(dataset.nodatavals[band - 1])
+    elif params.no_data is not None:
+        values[stored.data == stored.dtype.type(params.no_data)] = np.nan
+    crs = pyproj.CRS.from_user_input(dataset.crs) if dataset.crs else None
+    return RawGrid(values=values, x=x, y=y, crs=crs, says=says)
+
+
+def _choose_band(dataset: Any, path: Path, band: int | None) -> int:
+    if band is None and dataset.count > 1:
+        names = ", ".join(
+            f"{i} {d or ''}".strip() for i, d in enumerate(dataset.descriptions, start=1)
+        )
+        raise SourceError(
+            f"the file has {dataset.count} bands ({names})",
+            where=path,
+            remedy="choose one with the key 'band'",
+        )
+    if band is not None and band > dataset.count:
+        raise SourceError(f"key 'band' is {band}, but the file has {dataset.count}", where=path)
+    return band or 1
+
+
+def _nodes(dataset: Any, path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    transform = dataset.transform
+    if transform.is_identity:
+        raise FormatError(
+            "the raster has no position (geotransform)",
+            where=path,
+            expected="one that states a corner and the size of its cells",
+        )
+    if transform.b or transform.d:
+        raise FormatError(
+            f"the raster is rotated or sheared (b = {transform.b:g}, d = {transform.d:g})",
+            where=path,
+            expected="rows along x and columns along y",
+            remedy="resample it to an unrotated grid of its projection",
+        )
+    x = transform.c + transform.a * (np.arange(dataset.width) + 0.5)
+    y = transform.f + transform.e * (np.arange(dataset.height) + 0.5)
+    return x, y
+
+
+def _scaled(stored: Any, scale: float, offset: float) -> NDArray[np.float64]:
+    values: NDArray[np.float64] = stored.data.astype(np.float64) * scale + offset
+    values[np.ma.getmaskarray(stored)] = np.nan
+    return values

@@ -1,0 +1,108 @@
+"""Files inside gzip and zip, unpacked beside nothing: into a folder that is removed after."""
+
+from __future__ import annotations
+
+import contextlib
+import gzip
+import shutil
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+from typing import IO
+
+from magtiles.schemas.errors import FormatError, SourceError
+
+_LIMIT_BYTES = 16 << 30
+_BLOCK_BYTES = 1 << 20
+_PACKED = {b"\x1f\x8b": "gzip", b"PK\x03\x04": "zip"}
+
+
+@contextlib.contextmanager
+def unpacked(path: Path, member: str | None = None) -> Iterator[Path]:
+    """The file itself, or what the gzip or zip file at `path` holds, for as long as it is used.
+
+    Parameters
+    ----------
+    member : which file of a zip archive of several; files that belong to it (a data file beside
+        its header) are unpacked with it.
+
+    Raises FormatError for a damaged archive or one that unpacks to more than 16 GiB;
+    SourceError where the member is not clear.
+    """
+    kind = _kind(path)
+    if kind is None:
+        yield path
+        return
+    with tempfile.TemporaryDirectory(prefix="magtiles-") as name:
+        yield _unpack(kind, path, Path(name), member)
+
+
+def _unpack(kind: str, path: Path, folder: Path, member: str | None) -> Path:
+    try:
+        return _gunzip(path, folder) if kind == "gzip" else _unzip(path, folder, member)
+    except (OSError, EOFError, zlib.error, zipfile.BadZipFile, RuntimeError) as caught:
+        raise FormatError(
+            f"is not a whole {kind} file: {caught}", where=path, remedy="fetch it again"
+        ) from None
+
+
+def _kind(path: Path) -> str | None:
+    try:
+        with path.open("rb") as file:
+            head = file.read(4)
+    except OSError:
+        return None  # whoever reads it says what is wrong
+    return next((kind for magic, kind in _PACKED.items() if head.startswith(magic)), None)
+
+
+def _gunzip(path: Path, folder: Path) -> Path:
+    out = folder / (path.stem if path.suffix.lower() == ".gz" else path.name)
+    with gzip.open(path) as packed:
+        _copy(packed, out, path)
+    return out
+
+
+def _unzip(path: Path, folder: Path, member: str | None) -> Path:
+    with zipfile.ZipFile(path) as archive:
+        found = {
+            PurePosixPath(i.filename).name: i
+            for i in archive.infolist()
+            if not i.is_dir() and "__MACOSX" not in i.filename
+        }
+        wanted = _choose(found, path, member)
+        for name, info in found.items():
+            if name == wanted or PurePosixPath(name).stem == PurePosixPath(wanted).stem:
+                with archive.open(info) as packed:
+                    _copy(packed, folder / name, path)
+    return folder / wanted
+
+
+def _choose(found: dict[str, zipfile.ZipInfo], path: Path, member: str | None) -> str:
+    names = ", ".join(sorted(found)) or "none"
+    if member is not None:
+        if member not in found:
+            raise SourceError(f"key 'member' is '{member}'", where=path, expected=f"one of {names}")
+        return member
+    if len(found) != 1:
+        raise SourceError(
+            f"the archive holds {len(found)} files: {names}",
+            where=path,
+            expected="one",
+            remedy="choose one with the key 'member'",
+        )
+    return next(iter(found))
+
+
+def _copy(packed: IO[bytes], out: Path, path: Path) -> None:
+    written = 0
+    with out.open("wb") as file:
+        while block := packed.read(_BLOCK_BYTES):
+            written += len(block)
+            if written > min(_LIMIT_BYTES, shutil.disk_usage(out.parent).free + written):
+                raise FormatError(
+                    f"unpacks to more than {_LIMIT_BYTES >> 30} GiB, or than there is room for",
+                    where=path,
+                )
+            file.write(block)

@@ -1,0 +1,337 @@
+"""Every grid format: the same grid, written by another program or by hand, is read the same."""
+
+from __future__ import annotations
+
+import gzip
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import harmonica
+import netCDF4
+import numpy as np
+import pytest
+import rasterio
+import rasterio.shutil
+import xarray as xr
+
+from magtiles.schemas import contracts
+from magtiles.schemas.errors import FormatError, MagtilesError, SourceError
+from magtiles.stages.ingest import unpack
+from magtiles.stages.ingest.grid import STAGE, ingest_grid
+from magtiles.stages.ingest.source import IngestGridParams
+
+_SAID: dict[str, Any] = {
+    "height_m": 1500.0,
+    "height_reference": "ellipsoid",
+    "reference_field": "IGRF-14",
+    "reference_epoch": "1990-01-01",
+    "uncertainty_nt": 2.0,
+}
+X = 500_500.0 + 1000.0 * np.arange(4)
+Y = 5_000_500.0 + 1000.0 * np.arange(3)
+VALUES = np.arange(12.0).reshape(3, 4) - 5.25  # rows from the south
+VALUES[1, 2] = np.nan
+VALUES[0, 1] = 0.0  # a value
+
+
+def gdal(driver: str, mark: float) -> Callable[[Path], list[Path]]:
+    """A writer by GDAL, whose own the format is not."""
+
+    def write(folder: Path) -> list[Path]:
+        stored = np.where(np.isnan(VALUES), mark, VALUES)[::-1].astype(np.float32)
+        profile: dict[str, Any] = {"width": 4, "height": 3, "count": 1, "dtype": "float32"}
+        profile |= {"transform": rasterio.Affine(1000, 0, 5e5, 0, -1000, 5.003e6), "nodata": mark}
+        suffix = {"ERS": ".ers", "AAIGrid": ".asc"}.get(driver, ".grd")
+        made, path = folder / "made.tif", folder / f"grid{suffix}"
+        with rasterio.open(made, "w", driver="GTiff", **profile) as dataset:
+            dataset.write(stored, 1)
+        rasterio.shutil.copy(made, path, driver=driver)
+        return [path, path.with_suffix("")] if driver == "ERS" else [path]
+
+    return write
+
+
+def geosoft(
+    *, compressed: bool = False, along_y: bool = False, rotation: float = 0.0, dtype: str = "<f4"
+) -> Callable[[Path], list[Path]]:
+    """A grid by the published description of version 2 (512-byte header, dummies -1e32)."""
+
+    def write(folder: Path) -> list[Path]:
+        stored = np.where(np.isnan(VALUES), -1e32, VALUES)
+        stored = (stored.T if along_y else stored).astype(dtype)
+        size = stored.dtype.itemsize + (1024 if compressed else 0)
+        vectors, elements = stored.shape
+        head = struct.pack("<5i", size, 2, elements, vectors, -1 if along_y else 1)
+        head += struct.pack("<5d", 1000, 1000, X[0], Y[0], rotation) + struct.pack("<2d", 0, 1)
+        body = stored.tobytes()
+        if compressed:
+            packed = bytes(16) + zlib.compress(body)
+            body = struct.pack("<4iqi", 0, 0, 1, vectors, 512 + 16 + 12, len(packed)) + packed
+        path = folder / "grid.grd"
+        path.write_bytes(head.ljust(512, b"\0") + body)
+        return [path]
+
+    return write
+
+
+def old_gmt(*, cells: bool = False, count: int = 12) -> Callable[[Path], list[Path]]:
+    def write(folder: Path) -> list[Path]:
+        path = folder / "grid.grd"
+        half = 500.0 if cells else 0.0
+        with netCDF4.Dataset(path, "w", format="NETCDF3_CLASSIC") as dataset:
+            dataset.createDimension("side", 2)
+            dataset.createDimension("xysize", count)
+            for name, axis in (("x_range", X), ("y_range", Y)):
+                dataset.createVariable(name, "f8", ("side",))[:] = axis[0] - half, axis[-1] + half
+            dataset.createVariable("spacing", "f8", ("side",))[:] = 1000, 1000
+            dataset.createVariable("dimension", "i4", ("side",))[:] = 4, 3
+            z = dataset.createVariable("z", "f4", ("xysize",), fill_value=np.float32(np.nan))
+            z.setncatts({"scale_factor": 2.0, "add_offset": 1.0, "node_offset": int(cells)})
+            z.set_auto_scale(False)
+            z[:] = ((VALUES[::-1].ravel() - 1) / 2)[:count]
+        return [path]
+
+    return write
+
+
+def text(separator: str, head: str = "", tail: str = "") -> Callable[[Path], list[Path]]:
+    """Lines in no order, the void left out."""
+
+    def write(folder: Path) -> list[Path]:
+        lines = [
+            separator.join(f"{v:.2f}" for v in (X[i], Y[j], VALUES[j, i]))
+            for j in range(3)
+            for i in range(4)
+            if not np.isnan(VALUES[j, i])
+        ]
+        path = folder / "grid.xyz"
+        path.write_text(head + "\n".join(reversed(lines)) + "\n" + tail)
+        return [path]
+
+    return write
+
+
+def in_gzip(write: Callable[[Path], list[Path]]) -> Callable[[Path], list[Path]]:
+    def pack(folder: Path) -> list[Path]:
+        (plain,) = write(folder)
+        packed = folder / f"{plain.name}.gz"
+        packed.write_bytes(gzip.compress(plain.read_bytes()))
+        return [packed]
+
+    return pack
+
+
+def in_zip(write: Callable[[Path], list[Path]], *others: str) -> Callable[[Path], list[Path]]:
+    def pack(folder: Path) -> list[Path]:
+        packed = folder / "packed.zip"
+        with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+            for plain in write(folder):
+                archive.write(plain, f"inner/{plain.name}")
+            for other in others:
+                archive.writestr(other, "about it")
+        return [packed]
+
+    return pack
+
+
+@dataclass(frozen=True)
+class Expect:
+    write: Callable[[Path], list[Path]]
+    id: str
+    keys: tuple[tuple[str, Any], ...] = ()
+
+
+READ = [
+    Expect(gdal("GSAG", 1.70141e38), "surfer-6-text"),
+    Expect(gdal("GSBG", 1.70141e38), "surfer-6"),
+    Expect(gdal("GS7BG", 1.70141e38), "surfer-7"),
+    Expect(gdal("ERS", -9999.0), "er-mapper"),
+    Expect(gdal("AAIGrid", -9999.0), "esri-ascii"),
+    Expect(geosoft(), "geosoft"),
+    Expect(geosoft(compressed=True), "geosoft-compressed"),
+    Expect(geosoft(along_y=True, dtype="<f8"), "geosoft-by-columns"),
+    Expect(old_gmt(), "old-gmt"),
+    Expect(old_gmt(cells=True), "old-gmt-cells"),
+    Expect(text(" "), "xyz"),
+    Expect(text(",", "# made\nx,y,tmi\n"), "csv"),
+    Expect(text(", ", tail="502500,5001500,99999\n"), "csv-void", (("no_data", 99999.0),)),
+    Expect(in_gzip(text("\t")), "xyz-gzip"),
+    Expect(in_zip(geosoft()), "geosoft-zip"),
+    Expect(in_zip(gdal("ERS", -1.0)), "ers-zip", (("member", "grid.ers"),)),
+    Expect(in_zip(text(" "), "a.txt"), "xyz-zip-of-two", (("member", "grid.xyz"),)),
+]
+
+
+@pytest.mark.parametrize("expect", READ, ids=lambda expect: expect.id)
+def test_a_grid_is_the_same_in_every_format(expect: Expect, tmp_path: Path) -> None:
+    params = IngestGridParams(crs="EPSG:32610", **(_SAID | dict(expect.keys)))
+    grid = ingest_grid(expect.write(tmp_path), params=params)
+    contracts.check(grid, STAGE.output)
+    np.testing.assert_array_equal(grid.magnetic_anomaly, VALUES)
+    np.testing.assert_allclose(grid.x, X, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(grid.y, Y, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_geosoft_values_are_harmonicas_own(tmp_path: Path, compressed: bool) -> None:
+    (path,) = geosoft(compressed=compressed)(tmp_path)
+    grid = ingest_grid([path], params=IngestGridParams(crs="EPSG:32610", **_SAID))
+    own = harmonica.load_oasis_montaj_grid(str(path))
+    np.testing.assert_array_equal(grid.magnetic_anomaly, own.values)
+    np.testing.assert_array_equal(grid.x, own.easting.values)
+
+
+def test_a_sidecar_changes_nothing(tmp_path: Path) -> None:
+    """GDAL would take voids, places and CRS from files that receipts do not know."""
+    (path,) = gdal("AAIGrid", -9999.0)(tmp_path)
+    path.with_suffix(".prj").write_text("Projection UTM\nZone 11\n")
+    said = IngestGridParams(**_SAID)
+    with pytest.raises(SourceError, match="key 'crs' is missing"):
+        ingest_grid([path], params=said)
+
+
+def cut(write: Callable[[Path], list[Path]], share: float) -> Callable[[Path], list[Path]]:
+    def damage(folder: Path) -> list[Path]:
+        files = write(folder)
+        whole = files[-1].read_bytes()
+        files[-1].write_bytes(whole[: int(share * len(whole))])
+        return files
+
+    return damage
+
+
+def edited(old: str, new: str) -> Callable[[Path], list[Path]]:
+    def change(folder: Path) -> list[Path]:
+        (path,) = text(" ")(folder)
+        path.write_text(path.read_text().replace(old, new))
+        return [path]
+
+    return change
+
+
+@dataclass(frozen=True)
+class Refuse:
+    write: Callable[[Path], list[Path]]
+    error: type[MagtilesError]
+    message: str
+    id: str
+    keys: tuple[tuple[str, Any], ...] = ()
+
+
+_LAST = "500500.00 5000500.00 -5.25"
+REFUSED = [
+    Refuse(
+        cut(gdal("GSAG", 1.70141e38), 0.6),
+        FormatError,
+        "not a whole Surfer 6 text",
+        "surfer-6-text",
+    ),
+    Refuse(
+        cut(gdal("GSBG", 1.70141e38), 0.9), FormatError, "not a whole Surfer 6 grid", "surfer-6"
+    ),
+    Refuse(
+        cut(gdal("GS7BG", 1.70141e38), 0.9), FormatError, "not a whole Surfer 7 grid", "surfer-7"
+    ),
+    Refuse(
+        cut(gdal("ERS", -9999.0), 0.9), FormatError, r"grid: holds 43 bytes; expected 48", "ers"
+    ),
+    Refuse(
+        lambda f: gdal("ERS", -9999.0)(f)[:1], SourceError, "data file is not named", "ers-alone"
+    ),
+    Refuse(cut(gdal("AAIGrid", -9999.0), 0.8), FormatError, "not a whole ESRI ASCII", "esri-ascii"),
+    Refuse(cut(geosoft(), 0.99), FormatError, r"expected 4 x 3 values of 4 bytes", "geosoft"),
+    Refuse(cut(geosoft(compressed=True), 0.97), FormatError, "whole Geosoft", "geosoft-compressed"),
+    Refuse(geosoft(rotation=30.0), FormatError, "rotated by 30 degrees", "geosoft-rotated"),
+    Refuse(old_gmt(count=11), FormatError, r"z holds 11 values.*4 x 3 = 12", "old-gmt"),
+    Refuse(cut(text(" "), 0.98), FormatError, "last line has 2 columns", "xyz"),
+    Refuse(edited(_LAST, "500500 x -5"), FormatError, r"not numbers.*'x'", "xyz-word"),
+    Refuse(
+        edited("501500.00 5000500", "501700 5000500"),
+        FormatError,
+        r"line \d+: x = 501700 is no node",
+        "xyz-off",
+    ),
+    Refuse(
+        edited(_LAST, "501500 5000500 1"),
+        FormatError,
+        "line 11: the node was given before",
+        "xyz-twice",
+    ),
+    Refuse(
+        text(" "),
+        SourceError,
+        "column 4 is asked for, but line 1 has 3",
+        "xyz-columns",
+        (("columns", (1, 2, 4)),),
+    ),
+    Refuse(cut(in_gzip(text(" ")), 0.6), FormatError, r"grid.xyz.gz: is not a whole gzip", "gzip"),
+    Refuse(
+        in_zip(text(" "), "a.txt"),
+        SourceError,
+        r"holds 2 files: a.txt, grid.xyz.*'member'",
+        "zip-of-two",
+    ),
+    Refuse(
+        in_zip(text(" ")),
+        SourceError,
+        "key 'member' is 'b'; expected one of grid.xyz",
+        "member",
+        (("member", "b"),),
+    ),
+    Refuse(in_zip(cut(geosoft(), 0.99)), FormatError, r"zip \(grid.grd\): holds", "inside-zip"),
+]
+
+
+@pytest.mark.parametrize("refuse", REFUSED, ids=lambda refuse: refuse.id)
+def test_damaged_files_are_refused(refuse: Refuse, tmp_path: Path) -> None:
+    params = IngestGridParams(crs="EPSG:32610", **(_SAID | dict(refuse.keys)))
+    with pytest.raises(refuse.error, match=refuse.message):
+        ingest_grid(refuse.write(tmp_path), params=params)
+
+
+def test_a_bomb_is_not_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(unpack, "_LIMIT_BYTES", 1000)
+    path = tmp_path / "bomb.xyz.gz"
+    path.write_bytes(gzip.compress(bytes(10_000)))
+    with pytest.raises(FormatError, match="unpacks to more than"):
+        ingest_grid([path], params=IngestGridParams(**_SAID))
+
+
+def test_a_column_of_uncertainty(tmp_path: Path) -> None:
+    rows = [f"{i},{j},{x},{y},9,{v},{2 + i}" for j, y in enumerate((10.0, 10.5))
+            for i, (x, v) in enumerate(((179.5, 1.0), (180.0, 99999.0), (180.5, 3.0)))]  # fmt: skip
+    path = tmp_path / "emag2.csv"
+    path.write_text("\n".join(rows))
+    said = {k: v for k, v in _SAID.items() if k != "uncertainty_nt"}
+    params = IngestGridParams(
+        crs="EPSG:4326", columns=(3, 4, 6), uncertainty_column=7, no_data=99999.0, **said
+    )
+    grid = ingest_grid([path], params=params)
+    np.testing.assert_array_equal(grid.magnetic_anomaly, [[1, np.nan, 3]] * 2)
+    np.testing.assert_array_equal(grid.magnetic_anomaly_uncertainty, [[2, 3, 4]] * 2)
+    np.testing.assert_array_equal(grid.longitude, [179.5, 180.0, 180.5])
+
+
+class TestReal:
+    def _grid(self, path: Path) -> xr.Dataset:
+        return ingest_grid([path], params=IngestGridParams(crs="EPSG:4326", **_SAID))
+
+    def test_emag2_of_the_world(self, real_data: Path) -> None:
+        """Old GMT layout: 361 x 181, the meridian at both ends dropped once."""
+        grid = self._grid(real_data / "grids" / "EMAG2_V2_1x1.grd")
+        assert dict(grid.sizes) == {"latitude": 181, "longitude": 360}
+        assert float(grid.longitude[0]) == -180.0
+
+    def test_two_editions_of_emag2_agree(self, real_data: Path) -> None:
+        """The world's nodes are the patch's own, to the digits that the text was printed with."""
+        world = self._grid(real_data / "grids" / "EMAG2_V2_1x1.grd").magnetic_anomaly
+        patch = self._grid(real_data / "grids" / "emag2_v2_south_america.xyz").magnetic_anomaly
+        assert dict(patch.sizes) == {"latitude": 71, "longitude": 101}
+        whole = patch.isel(latitude=slice(10, None, 20), longitude=slice(0, None, 20))
+        same = world.sel(latitude=whole.latitude, longitude=whole.longitude, method="nearest")
+        assert float(abs(whole.values - same.values).max()) < 1e-3
