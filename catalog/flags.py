@@ -35,6 +35,17 @@ UNFIT_RECORD = RecordFlag.SPIKE | RecordFlag.STUCK | RecordFlag.TOTAL_MISMATCH
 """Samples that carry one of these are left out of baselines and statistics."""
 
 
+class QuietDayChoice(enum.IntFlag):
+    """How the quiet days of a month were chosen, and what they lack (uint8)."""
+
+    LIST = 1
+    KP = 2
+    RECORD = 4
+    STANDBY = 8
+    FEWER_THAN_FIVE = 16
+    TOO_FEW_DAYS = 32
+
+
 class TrackFlag(enum.IntFlag):
     """What is doubtful of a sample of a track (uint16)."""
 
