@@ -59,14 +59,13 @@ def read_xyz(path: Path, params: IngestGridParams) -> RawGrid:
         )
     node = rows_of * x.size + columns_of
     _refuse_repeated(node, path, first_line)
-    values = np.full(y.size * x.size, np.nan)
-    values[node] = mark_voids(table[:, 2], params.no_data)
-    uncertainty = None
-    if params.uncertainty_column:
-        uncertainty = np.full(values.size, np.nan)
-        uncertainty[node] = mark_voids(table[:, 3], params.no_data)
-        uncertainty = uncertainty.reshape(y.size, x.size)
-    return RawGrid(values.reshape(y.size, x.size), x, y, None, uncertainty=uncertainty)
+    shape = y.size, x.size
+    maps = []
+    for column in table[:, 2:].T:
+        values = np.full(shape, np.nan)
+        values.flat[node] = mark_voids(column, params.no_data)
+        maps.append(values)
+    return RawGrid(maps[0], x, y, None, uncertainty=maps[1] if len(maps) > 1 else None)
 
 
 def _table(path: Path, columns: list[int]) -> tuple[NDArray[np.float64], int]:

@@ -96,7 +96,7 @@ def table_of(kind: type[Params]) -> str:
         unit = str(extra["unit"]) if isinstance(extra, dict) else "1"
         unit = "" if unit == "1" else unit
         default = "required" if field.is_required() else ""
-        elif field.default not in (None, {}):
+        if not field.is_required() and field.default not in (None, {}):
             default = f"`{json.dumps(field.default)}`"
         meaning = str(field.description).replace("|", r"\|")
         lines.append(f"| `{name}` | {unit} | {default} | {meaning} |")
