@@ -10,9 +10,14 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
-from typing import IO
+from typing import Protocol
 
 from magtiles.schemas.errors import FormatError, SourceError
+
+
+class _Readable(Protocol):
+    def read(self, size: int, /) -> bytes: ...
+
 
 _LIMIT_BYTES = 16 << 30
 _BLOCK_BYTES = 1 << 20
@@ -95,7 +100,7 @@ def _choose(found: dict[str, zipfile.ZipInfo], path: Path, member: str | None) -
     return next(iter(found))
 
 
-def _copy(packed: IO[bytes], out: Path, path: Path) -> None:
+def _copy(packed: _Readable, out: Path, path: Path) -> None:
     written = 0
     with out.open("wb") as file:
         while block := packed.read(_BLOCK_BYTES):
