@@ -19,6 +19,7 @@ from types import ModuleType
 
 from magtiles.pipeline.commands import (
     build,
+    diff,
     info,
     plot,
     query,
@@ -29,7 +30,7 @@ from magtiles.pipeline.commands import (
 )
 from magtiles.schemas.errors import MagtilesError, UsageError
 
-COMMANDS: tuple[ModuleType, ...] = (build, validate, info, query, plot, sample, stages, run)
+COMMANDS: tuple[ModuleType, ...] = (build, validate, diff, info, query, plot, sample, stages, run)
 """Each offers HELP, NEEDS_PIPELINE, add_arguments(parser) and run(arguments) -> exit status."""
 
 BAD_DATA, BAD_USE, INTERRUPTED, BROKEN_PIPE = 1, 2, 130, 141

@@ -19,6 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``magtiles validate``."""
     parser.add_argument("release", type=Path, metavar="RELEASE", help="folder of a release")
     parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument("--junit", type=Path, metavar="FILE.xml", help="write JUnit XML too")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -27,6 +28,10 @@ def run(arguments: argparse.Namespace) -> int:
 
     checks = validate_release(arguments.release)
     passed = all(check.passed for check in checks)
+    if arguments.junit is not None:
+        from magtiles.pipeline.junit import write_junit
+
+        write_junit(checks, arguments.release, arguments.junit)
     if arguments.json:
         print_json({"release": arguments.release, "passed": passed, "checks": checks})
     else:

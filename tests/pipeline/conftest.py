@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -207,6 +208,20 @@ def exact_release(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def spoilt_release(tmp_path: Path) -> Callable[[Change], Path]:
     """Builds the release with altered arrays, digests and all."""
     return lambda change: build_release(tmp_path / "spoilt", change)
+
+
+@pytest.fixture
+def finer_release(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The same field on a lattice of four fifths of the spacing."""
+    finer = dataclasses.replace(
+        LATTICE,
+        latitude_spacing=0.8 * LATTICE.latitude_spacing,
+        longitude_spacing=0.8 * LATTICE.longitude_spacing,
+        rows=LATTICE.rows * 5 // 4,
+        columns=LATTICE.columns * 5 // 4,
+    )
+    monkeypatch.setitem(globals(), "LATTICE", finer)
+    return build_release(tmp_path / "finer")
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,94 @@
+"""What changed between two releases is found where it was made, and sized as it was made."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from magtiles.catalog.flags import QualityFlag
+from magtiles.catalog.kernels.bspline import HALO
+from magtiles.catalog.releases.manifest import read_manifest
+from magtiles.pipeline.difference import compare_releases
+from magtiles.pipeline.main import main
+
+QUANTITIES = ["total", "north", "east", "down", "nn", "ne", "nd", "ee", "ed"]
+
+
+def test_a_release_does_not_differ_from_itself(exact_release: Path) -> None:
+    found = compare_releases(exact_release, exact_release)
+    assert (found.bump, found.enough, found.reason) == (None, True, "nothing changed")
+    assert [one.quantity for one in found.levels[:9]] == QUANTITIES
+    assert len(found.levels) == 9 * len(read_manifest(exact_release).heights_m)
+    assert not any(one.changed or one.largest for one in found.levels)
+    assert (found.gained, found.lost, found.interpolated) == (0, 0, False)
+
+
+def test_one_changed_node_is_found(exact_release: Path, spoilt_release: Callable) -> None:
+    def change(row, column, arrays):
+        if (row, column) == (0, 0):
+            arrays["magnetic_anomaly"][1, HALO + 3, HALO + 4] += np.float32(5.0)
+
+    new = spoilt_release(change)
+    found = compare_releases(exact_release, new)
+    assert (found.bump, found.enough) == ("minor", False)  # both are 1.2.3
+    (one,) = [one for one in found.levels if one.changed]
+    manifest = read_manifest(exact_release)
+    assert (one.quantity, one.height_m) == ("total", manifest.heights_m[1])
+    assert one.changed == 1
+    assert one.largest == pytest.approx(5.0, abs=1e-4)  # f4 of some hundred nT
+    assert one.rms == pytest.approx(5.0 / np.sqrt(one.nodes), rel=1e-4)
+    assert one.sigmas == pytest.approx(2.5, rel=1e-4)
+    lattice = manifest.lattice
+    assert one.latitude == pytest.approx(lattice.south + 3 * lattice.latitude_spacing)
+    assert one.longitude == pytest.approx(lattice.west + 4 * lattice.longitude_spacing)
+
+
+def test_coverage_gained(exact_release: Path, spoilt_release: Callable) -> None:
+    """The eastern edge, one column of nodes, is beyond coverage in the old release only."""
+
+    def change(row, column, arrays):
+        arrays["quality_flag"] &= np.uint8(~QualityFlag.BEYOND_COVERAGE & 0xFF)
+
+    new = spoilt_release(change)
+    rows = read_manifest(exact_release).lattice.rows
+    found = compare_releases(exact_release, new)
+    assert (found.gained, found.lost) == (rows + 1, 0)
+    back = compare_releases(new, exact_release)
+    assert (back.gained, back.lost) == (0, rows + 1)
+
+
+def test_another_lattice_is_interpolated(exact_release: Path, finer_release: Path) -> None:
+    """The same field on both: what is left is the interpolation's error, 0.3 % of the rms."""
+    found = compare_releases(exact_release, finer_release)
+    assert found.interpolated
+    assert found.bump == "major"
+    lowest = {one.quantity: one for one in found.levels[:9]}
+    assert lowest["total"].nodes > 1000
+    rms = np.sqrt(np.mean([t.statistics["magnetic_anomaly"]["rms"][0] ** 2
+                           for t in read_manifest(exact_release).tiles.values()]))  # fmt: skip
+    assert lowest["total"].rms < 0.003 * rms
+
+
+def test_the_command(
+    exact_release: Path, finer_release: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    picture = tmp_path / "change.png"
+    arguments = ["diff", str(exact_release), str(finer_release)]
+    assert main([*arguments, "--map", str(picture)]) == 1
+    printed = capsys.readouterr().out
+    assert "exact 1.2.3 to exact 1.2.3: the grid changed from" in printed
+    assert "due a MAJOR bump, and has NOT got it" in printed
+    assert "the lattices differ" in printed
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert main([*arguments, "--json"]) == 1
+    document = json.loads(capsys.readouterr().out)
+    assert document["bump"] == "major"
+    assert len(document["levels"]) % 9 == 0
+    assert main(["diff", str(exact_release), str(exact_release)]) == 0
+    assert "nothing changed" in capsys.readouterr().out
+    assert main([*arguments, "--map", str(picture), "--level", "7"]) == 2
+    assert "no such level in both releases" in capsys.readouterr().err
