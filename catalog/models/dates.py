@@ -45,6 +45,34 @@ def decimal_year(date: Date) -> NDArray[np.float64]:
     return years
 
 
+def instant(date: Date) -> NDArray[np.datetime64]:
+    """Dates (...), as `decimal_year` takes them, as datetime64[ns] UTC.
+
+    Raises QueryError for what is no date, or lies before 1700 or after 2200, which nanoseconds
+    do not reach.
+
+    >>> instant(2020.5)
+    array('2020-07-02T00:00:00.000000000', dtype='datetime64[ns]')
+    """
+    values = np.asarray(_as_utc(date) if isinstance(date, datetime) else date)
+    years = decimal_year(date)
+    if not ((years >= 1700.0) & (years < 2200.0)).all():
+        index = int(np.flatnonzero(~((years >= 1700.0) & (years < 2200.0)).ravel())[0])
+        raise QueryError(
+            f"date is {years.ravel()[index]:.12g}",
+            where=f"date[{index}]",
+            expected="a date from 1700 to 2199",
+        )
+    if values.dtype.kind == "M":  # exact, where a decimal year is to 10 microseconds
+        return values.astype("datetime64[ns]")
+    whole = np.floor(years)
+    start = (whole.astype(np.int64) - 1970).astype("datetime64[Y]")
+    first = start.astype("datetime64[us]")
+    length = (start + 1).astype("datetime64[us]") - first
+    part = np.rint((years - whole) * length.astype(np.float64)).astype("timedelta64[us]")
+    return np.asarray((first + part).astype("datetime64[ns]"))
+
+
 def _as_utc(date: Any) -> np.datetime64:
     if isinstance(date, datetime) and date.tzinfo is not None:
         date = date.astimezone(UTC).replace(tzinfo=None)

@@ -33,11 +33,14 @@ def array_digest(variables: Mapping[str, NDArray[Any]]) -> str:
     """Digest of arrays by name: the same whatever the container, compression or byte order.
 
     SHA-256 over, for every variable in order of name, one line of canonical JSON
-    ``[name, dtype, shape]`` ending in a newline, then the values little-endian in C order.
+    ``[name, dtype, shape]`` ending in a newline, then the values little-endian in C order. Text
+    counts as UTF-8, filled up with zero bytes to the longest: its dtype is ``bytes24`` for three.
     """
     total = hashlib.sha256()
     for name in sorted(variables):
         values = np.asarray(variables[name])
+        if values.dtype.kind == "U":
+            values = np.char.encode(values, "utf-8")
         little = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
         total.update(canonical_json([name, values.dtype.name, list(values.shape)]) + b"\n")
         total.update(little.data if little.ndim else little.tobytes())

@@ -113,20 +113,8 @@ class ReleaseAnomaly(Anomaly):
 
     @cached_property
     def _core(self) -> FieldModel:
-        from magtiles.catalog.models import parse_model
-
-        where = f"release {self._manifest.product} {self._manifest.version}"
-        field = str(self._manifest.document["identity"]["reference_field"])
-        _refuse_unknown_surface(self._manifest, where)
-        if CORE_FIELD not in {file.path for file in self._manifest.files}:
-            raise ContractError(
-                f"has no {CORE_FIELD}; its reference field is '{field}'",
-                where=where,
-                expected="the coefficients of the core field that its anomaly counts from",
-                remedy="add a core field of your own to `total` or `vector`",
-            )
-        text = self._read(CORE_FIELD).decode("utf-8", errors="replace")
-        return replace(parse_model(text, f"{where}: {CORE_FIELD}"), name=field)
+        _refuse_unknown_surface(self._manifest)
+        return core_field(self._manifest, self._read)
 
     def _arguments(
         self, latitude: ArrayLike, longitude: ArrayLike, height: ArrayLike, time: Date
@@ -162,6 +150,25 @@ class ReleaseAnomaly(Anomaly):
         return vector, tensor
 
 
+def core_field(manifest: Manifest, read: Callable[[str], bytes]) -> FieldModel:
+    """The core field of a release, parsed from the bytes that `read` gives of its file.
+
+    Raises ContractError for a release without one, FormatError for one that is no model.
+    """
+    from magtiles.catalog.models import parse_model
+
+    field = str(manifest.document["identity"]["reference_field"])
+    if CORE_FIELD not in {file.path for file in manifest.files}:
+        raise ContractError(
+            f"has no {CORE_FIELD}; its reference field is '{field}'",
+            where=_name(manifest),
+            expected="the coefficients of the core field that its anomaly counts from",
+            remedy="add a core field of your own to `total` or `vector`",
+        )
+    text = read(CORE_FIELD).decode("utf-8", errors="replace")
+    return replace(parse_model(text, f"{_name(manifest)}: {CORE_FIELD}"), name=field)
+
+
 def turning(vector: Floats, latitude: Floats, height: Floats) -> Floats:
     """What the turning of north, east and down adds to the gradient of a vector, nT/km.
 
@@ -180,12 +187,16 @@ def turning(vector: Floats, latitude: Floats, height: Floats) -> Floats:
     return out
 
 
-def _refuse_unknown_surface(manifest: Manifest, where: str) -> None:
+def _name(manifest: Manifest) -> str:
+    return f"release {manifest.product} {manifest.version}"
+
+
+def _refuse_unknown_surface(manifest: Manifest) -> None:
     if not manifest.takes_ellipsoidal_height:
         surface = manifest.height_reference.replace("_", " ")
         raise ContractError(
             f"its heights count from {surface}, whose own height it does not know",
-            where=where,
+            where=_name(manifest),
             expected="a release with heights above the ellipsoid, or a reference_surface_height",
             remedy="a core field cannot be evaluated above an unknown surface",
         )

@@ -19,12 +19,13 @@ from magtiles.catalog.releases.digest import manifest_digest
 from magtiles.catalog.releases.fields import REMEDY, Fields, parse_json
 from magtiles.catalog.releases.folder import read_bytes
 from magtiles.catalog.releases.lattice import Lattice
+from magtiles.catalog.releases.temporal_table import PATH as TEMPORAL_PATH
 from magtiles.catalog.releases.tile_table import TILE_VARIABLES
 from magtiles.schemas.errors import IntegrityError
 
 CONTRACT = "release-manifest/1.0.0"
 MANIFEST_NAME = "manifest.json"
-ROLES = ("tile", "checks", "provenance", "preview", "core_field")
+ROLES = ("tile", "temporal", "checks", "provenance", "preview", "core_field")
 HEIGHT_REFERENCES = ("ellipsoid", "mean_sea_level", "terrain")
 
 MAX_MANIFEST_BYTES = 256 << 20
@@ -73,6 +74,13 @@ class TileRecord(FileRecord):
 
 
 @dataclass(frozen=True)
+class TemporalRecord(FileRecord):
+    """The temporal model, and the digest of its arrays."""
+
+    array_digest: str
+
+
+@dataclass(frozen=True)
 class InputRecord:
     """A source the release was made from."""
 
@@ -103,6 +111,11 @@ class Manifest:
     def tiles(self) -> Mapping[tuple[int, int], TileRecord]:
         """Tiles by row and column."""
         return {(f.row, f.column): f for f in self.files if isinstance(f, TileRecord)}
+
+    @cached_property
+    def temporal(self) -> TemporalRecord | None:
+        """The temporal model's record; None where the release has none."""
+        return next((f for f in self.files if isinstance(f, TemporalRecord)), None)
 
     @cached_property
     def has_reference_surface(self) -> bool:
@@ -201,6 +214,9 @@ def _file(fields: Fields, lattice: Lattice, levels: int) -> FileRecord:
         "role": role,
         "contract": None if fields.plain().get("contract") is None else fields.text("contract"),
     }
+    if role == "temporal":
+        fields.only(*TemporalRecord.__dataclass_fields__)
+        return TemporalRecord(**base, array_digest=fields.text("array_digest", _SHA256))
     if role != "tile":
         fields.only(*base)
         return FileRecord(**base)
@@ -255,6 +271,8 @@ def _check_files(manifest: Manifest, top: Fields) -> None:
         raise top.problem("files", "name a path twice", "each path once")
     if any(path != posixpath.normpath(path) or path == MANIFEST_NAME for path in paths):
         raise top.problem("files", "hold an unsafe path", "plain paths inside the release")
+    if any((file.role == "temporal") != (file.path == TEMPORAL_PATH) for file in manifest.files):
+        raise top.problem("files", "have a temporal model elsewhere", f"it at {TEMPORAL_PATH}")
     if any(path.split("/")[0] in paths for path in paths if "/" in path):
         raise top.problem("files", "use a file as a folder", "plain paths inside the release")
     rows, columns = manifest.lattice.shape

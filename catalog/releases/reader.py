@@ -8,10 +8,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from magtiles.catalog.releases.expected import ReleaseAnomaly
+from magtiles.catalog.releases.expected import ReleaseAnomaly, core_field
 from magtiles.catalog.releases.folder import check_folder, read_verified
 from magtiles.catalog.releases.manifest import MANIFEST_NAME, Manifest, read_manifest
 from magtiles.catalog.releases.store import DEFAULT_CACHE_BYTES, TileStore
+from magtiles.catalog.releases.temporal import TemporalModel
+from magtiles.catalog.releases.temporal_file import read_temporal
 from magtiles.catalog.releases.tile import TileData
 from magtiles.schemas.errors import IntegrityError, QueryError
 
@@ -32,10 +34,24 @@ class Release:
         """Queries of the anomaly, and of the whole field that is expected with it."""
         return ReleaseAnomaly(self.manifest, self._store, self._extrapolate, self.file)
 
-    @property
-    def temporal(self) -> Any:
-        """The model of time variations; raises QueryError when the release has none."""
-        raise self._lacks("temporal model")
+    @cached_property
+    def temporal(self) -> TemporalModel:
+        """The model of time variations; raises QueryError when the release has none.
+
+        Verified when it is first asked for: IntegrityError when it is not what the manifest
+        says.
+        """
+        record = self.manifest.temporal
+        if record is None:
+            raise self._lacks("temporal model")
+        with self._store.lock:
+            data = read_temporal(self.file(record.path), self.path / record.path)
+        return TemporalModel(
+            data,
+            lambda: core_field(self.manifest, self.file),
+            f"release {self.manifest.product} {self.manifest.version}",
+            allow_extrapolated=self._extrapolate,
+        )
 
     @property
     def roads(self) -> Any:

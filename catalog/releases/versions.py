@@ -8,7 +8,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from magtiles.catalog.releases.lattice import Lattice
-from magtiles.catalog.releases.manifest import VERSION, FileRecord, Manifest, TileRecord
+from magtiles.catalog.releases.manifest import (
+    VERSION,
+    FileRecord,
+    Manifest,
+    TemporalRecord,
+    TileRecord,
+)
 from magtiles.schemas.errors import VersionError
 
 Version = tuple[int, int, int]
@@ -112,6 +118,9 @@ def _new_values(old: Manifest, new: Manifest) -> Iterable[str]:
     for place in sorted(set(old.tiles) & set(new.tiles)):
         if old.tiles[place].array_digest != new.tiles[place].array_digest:
             yield f"arrays changed in {new.tiles[place].path}"
+    digests = _temporal_digest(old), _temporal_digest(new)
+    if digests[0] != digests[1]:
+        yield f"the temporal model {'came or went' if None in digests else 'changed'}"
     before, after = _content(old, "core_field"), _content(new, "core_field")
     if before != after:
         yield "the core field's coefficients changed"
@@ -124,10 +133,15 @@ def _new_description(old: Manifest, new: Manifest) -> Iterable[str]:
         if path not in before or path not in after:
             yield f"{path} came or went"
         elif before[path].sha256 != after[path].sha256:
-            same = ", its arrays did not" if isinstance(after[path], TileRecord) else ""
+            arrays = isinstance(after[path], (TileRecord, TemporalRecord))
+            same = ", its arrays did not" if arrays else ""
             yield f"{path} changed{same}"
     if old.inputs != new.inputs:
         yield "the inputs' records changed"
+
+
+def _temporal_digest(manifest: Manifest) -> str | None:
+    return None if manifest.temporal is None else manifest.temporal.array_digest
 
 
 def _content(manifest: Manifest, role: str) -> list[tuple[str, str]]:

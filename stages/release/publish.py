@@ -25,6 +25,7 @@ from magtiles.catalog.releases.manifest import (
     read_manifest,
 )
 from magtiles.catalog.releases.reader import open_release
+from magtiles.catalog.releases.temporal_table import PATH as TEMPORAL_PATH
 from magtiles.catalog.releases.tile_table import UNITS
 from magtiles.catalog.releases.versions import (
     check_same,
@@ -42,6 +43,7 @@ from magtiles.stages.release.records import (
     common_lattice,
     measure_tile,
 )
+from magtiles.stages.release.temporal_file import measure_temporal
 
 LATEST_NAME = "latest.json"
 PROVENANCE_NAME = "provenance.json"
@@ -50,6 +52,7 @@ _STAGING = ".staging."
 _EXTRA_ROLES = {
     r"preview/[A-Za-z0-9_-][A-Za-z0-9._-]*": "preview",
     r"core_field\.shc": "core_field",
+    r"temporal\.nc": "temporal",
 }
 _DATUM = "WGS84"
 
@@ -83,7 +86,8 @@ def publish_release(
         a value that contradicts the tiles raises ContractError.
     inputs : the sources, each with the keys id, sha256, licence and role.
     provenance : how it was made, any JSON.
-    extra_files : ``preview/*`` and ``core_field.shc``, path in the release to file.
+    extra_files : ``preview/*``, ``core_field.shc`` and ``temporal.nc`` (as `write_temporal`
+        makes it, and with a core field), path in the release to file.
 
     Returns
     -------
@@ -107,6 +111,8 @@ def publish_release(
     files = {PROVENANCE_NAME: canonical_json(provenance), **extras}
     final = home / version
     _add_files(document, files)
+    if TEMPORAL_PATH in extra_files:
+        _add_temporal(document, extra_files)
     changed = not _exists_already(home, _sealed(document))
     if changed:
         _build(home, final, document, measured, files)
@@ -194,7 +200,9 @@ def _shared(tiles: Sequence[MeasuredTile], get: Any, name: str) -> Any:
 def _extra(path: str, file: Path) -> bytes:
     if not any(re.fullmatch(pattern, path) for pattern in _EXTRA_ROLES):
         raise ContractError(
-            "has no place in a release", where=path, expected="preview/<name> or core_field.shc"
+            "has no place in a release",
+            where=path,
+            expected=f"preview/<name>, core_field.shc or {TEMPORAL_PATH}",
         )
     return file.read_bytes()
 
@@ -211,6 +219,24 @@ def _add_files(document: dict[str, Any], files: Mapping[str, bytes]) -> None:
         {"path": path, "size": len(data), "sha256": sha256(data), "role": _role(path)}
         for path, data in files.items()
     ]
+
+
+def _add_temporal(document: dict[str, Any], extra_files: Mapping[str, Path]) -> None:
+    """Replace the plain entry of temporal.nc by its whole record."""
+    if "core_field.shc" not in extra_files:
+        raise ContractError(
+            "comes without a core field, which tells dip latitude and total field by",
+            where=extra_files[TEMPORAL_PATH],
+            expected="core_field.shc beside it",
+            remedy="name a reference field whose coefficients are at hand, such as IGRF-14",
+        )
+    record = measure_temporal(extra_files[TEMPORAL_PATH])
+    plain = next(file for file in document["files"] if file["path"] == TEMPORAL_PATH)
+    if plain["sha256"] != record["sha256"]:
+        raise ContractError(
+            "changed while it was being published", where=extra_files[TEMPORAL_PATH]
+        )
+    plain |= record
 
 
 def _sealed(document: Mapping[str, Any]) -> Manifest:

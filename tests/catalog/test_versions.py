@@ -51,6 +51,13 @@ def add_core_field(d: dict[str, Any]) -> None:
     )
 
 
+def add_temporal(d: dict[str, Any], digest: str = "3" * 64, sha256: str = "4" * 64) -> None:
+    d["files"].append(
+        {"path": "temporal.nc", "size": 1, "sha256": sha256, "role": "temporal",
+         "contract": "temporal-model/1.0.0", "array_digest": digest}
+    )  # fmt: skip
+
+
 class Expect(NamedTuple):
     change: Callable[[dict[str, Any]], Any]
     bump: str | None
@@ -73,6 +80,7 @@ CASES = [
     Expect(lambda d: d.update(heights_m=[0, 1000, 2000, 4000, 8001]), "minor", "heights", "level"),
     Expect(new_arrays, "minor", "arrays changed in tiles/r001c001.nc", "values"),
     Expect(add_core_field, "minor", "core field", "core field"),
+    Expect(add_temporal, "minor", "temporal model came", "temporal model"),
     Expect(lambda d: d["files"][4].update(sha256="3" * 64), "patch", "arrays did not", "text"),
     Expect(lambda d: d["inputs"][0].update(licence="MIT"), "patch", "inputs", "licence"),
 ]  # fmt: skip
@@ -83,6 +91,16 @@ def test_each_change_is_due_its_bump(document: dict[str, Any], case: Expect) -> 
     change = required_bump(edited(document, lambda d: None), edited(document, case.change))
     assert change.bump == case.bump
     assert case.reason in change.reason
+
+
+def test_a_temporal_models_arrays_are_minor_and_its_words_a_patch(document: dict[str, Any]) -> None:
+    old = edited(document, add_temporal)
+    words = edited(document, lambda d: add_temporal(d, sha256="5" * 64))
+    assert required_bump(old, words).bump == "patch"
+    assert required_bump(old, words).reason == "temporal.nc changed, its arrays did not"
+    values = edited(document, lambda d: add_temporal(d, digest="6" * 64, sha256="5" * 64))
+    assert required_bump(old, values).bump == "minor"
+    assert required_bump(old, values).reason == "the temporal model changed"
 
 
 class Step(NamedTuple):
