@@ -9,8 +9,10 @@ from typing import Annotated, Literal
 
 import pydantic
 
+from magtiles.catalog.models.igrf import igrf_files
 from magtiles.schemas.errors import SourceError
-from magtiles.stages.declare import Params, parse_params, quantity
+from magtiles.stages.declare import IsoDate, Params, parse_params, quantity
+from magtiles.stages.ingest.field_model import FIELD_MODEL, igrf_coefficients, model_files
 from magtiles.stages.ingest.source import (
     ANOMALY_GRID,
     IngestGridParams,
@@ -18,6 +20,7 @@ from magtiles.stages.ingest.source import (
     load_source,
     load_toml,
 )
+from magtiles.stages.release.plan import Bounds
 
 _LOWEST_M, _HIGHEST_M = -12_000.0, 100_000.0
 """From the deepest sea to where a map of one survey's plane ends to be one of the round Earth."""
@@ -55,6 +58,12 @@ class RegionTable(Params):
     longitude: Annotated[tuple[float, float], pydantic.AfterValidator(_west_east)] = quantity(
         "degrees_east", doc="West and east limits; west > east crosses the date line."
     )
+
+    @property
+    def bounds(self) -> Bounds:
+        """South, north, west, east; east counted on from west."""
+        (south, north), (west, east) = self.latitude, self.longitude
+        return south, north, west, west + ((east - west) % 360.0 or 360.0)
 
 
 def _distinct(heights: tuple[float, ...]) -> tuple[float, ...]:
@@ -102,22 +111,87 @@ class AnomalyTable(Params):
     )
 
 
+class ModelTable(Params):
+    """[model]: the map of a field model's crust, in place of [anomaly]."""
+
+    coefficients: str = quantity(
+        "1", doc="A coefficient file or folder, a source TOML, or the id of one in the catalog."
+    )
+    core: str | None = quantity(
+        "1", default=None, doc="Core field of another model: IGRF-14, or a file; default its own."
+    )
+    epoch: IsoDate = quantity("1", doc="Date of the core field.")
+    heights_m: Annotated[tuple[float, ...], pydantic.AfterValidator(_distinct)] = quantity(
+        "m", doc="Heights of the levels above the ellipsoid."
+    )
+    core_degree: int = quantity("1", default=15, ge=1, doc="Highest degree of the core field.")
+    crust_degree: int = quantity("1", default=16, ge=2, doc="Lowest degree of the anomaly.")
+    highest_degree: int | None = quantity(
+        "1", default=None, ge=2, doc="Highest degree of the anomaly; default the model's."
+    )
+    region: RegionTable | None = quantity(
+        "1", default=None, doc="Limits; default the globe between 85 degrees south and north."
+    )
+    spacing_m: float | None = quantity(
+        "m", default=None, gt=0, doc="Node spacing; default an eighth of the shortest wavelength."
+    )
+    tile_deg: float | None = quantity(
+        "degree", default=None, gt=0, le=90, doc="Size of a tile; default some 300 cells or more."
+    )
+    uncertainty_nt: float | None = quantity(
+        "nT",
+        default=None,
+        gt=0,
+        doc="1 sigma of a component at the ellipsoid; default the source's.",
+    )
+
+
 class ProductTables(Params):
-    """The whole of a product TOML."""
+    """The whole of a product TOML: one of [anomaly] and [model]."""
 
     product: ProductTable = quantity("1", doc="Name and version.")
-    anomaly: AnomalyTable = quantity("1", doc="The anomaly map.")
+    anomaly: AnomalyTable | None = quantity("1", default=None, doc="The map of a survey.")
+    model: ModelTable | None = quantity("1", default=None, doc="The map of a field model.")
+
+
+@dataclass(frozen=True)
+class SurveyMap:
+    """The map of a survey: what is asked of it, its source TOML's path, and that TOML read."""
+
+    table: AnomalyTable
+    path: Path
+    source: Source[IngestGridParams]
+
+
+@dataclass(frozen=True)
+class ModelMap:
+    """The map of a field model.
+
+    Attributes
+    ----------
+    table : what is asked of it.
+    path : the source TOML, or the coefficient file or folder itself.
+    id, licence, url : as the TOML says; the name of the file, "not stated" and None without.
+    files : of the coefficients.
+    core : file of another core field, if one was asked for.
+    """
+
+    table: ModelTable
+    path: Path
+    id: str
+    licence: str
+    url: str | None
+    files: tuple[Path, ...]
+    core: Path | None
 
 
 @dataclass(frozen=True)
 class Product:
-    """A product with its source found and read."""
+    """A product with what its map is made from, found and read."""
 
     path: Path
     product: ProductTable
-    anomaly: AnomalyTable
-    source_path: Path
-    source: Source[IngestGridParams]
+    map: SurveyMap | ModelMap
 
 
 def load_product(path: Path) -> Product:
@@ -128,20 +202,57 @@ def load_product(path: Path) -> Product:
     tables: ProductTables = parse_params(
         ProductTables, load_toml(path), where=path, error=SourceError
     )
-    source_path = _find_source(tables.anomaly.source, path)
+    if (tables.anomaly is None) == (tables.model is None):
+        both = "both [anomaly] and [model]" if tables.anomaly else "neither [anomaly] nor [model]"
+        raise SourceError(
+            f"there is {both}",
+            where=path,
+            expected="one: a survey's map, or a field model's",
+            remedy="make two products of it" if tables.anomaly else "add one",
+        )
+    if tables.model is not None:
+        return Product(path, tables.product, _model_map(tables.model, path))
+    assert tables.anomaly is not None
+    source_path = _find_source(tables.anomaly.source, path, "anomaly.source")
     source = load_source(source_path, ANOMALY_GRID)
     _check_reference(tables.anomaly, source, path)
-    return Product(path, tables.product, tables.anomaly, source_path, source)
+    return Product(path, tables.product, SurveyMap(tables.anomaly, source_path, source))
 
 
-def _find_source(name: str, product: Path) -> Path:
+def _model_map(model: ModelTable, product: Path) -> ModelMap:
+    core = None if model.core is None else _find_core(model.core, product)
+    direct = product.parent / model.coefficients
+    if direct.exists() and direct.suffix != ".toml":
+        files = tuple(model_files(direct))
+        return ModelMap(model, direct, direct.stem, "not stated", None, files, core)
+    path = _find_source(model.coefficients, product, "model.coefficients")
+    source = load_source(path, FIELD_MODEL)
+    header = source.source
+    return ModelMap(model, path, header.id, header.licence, header.url, source.files, core)
+
+
+def _find_core(name: str, product: Path) -> Path:
+    file = igrf_coefficients(name)
+    if file is None and (product.parent / name).is_file():
+        file = product.parent / name
+    if file is None:
+        known = ", ".join(f"IGRF-{generation}" for generation in sorted(igrf_files()))
+        raise SourceError(
+            f"'{name}' is no core field at hand",
+            where=f"{product} model.core",
+            expected=f"one of {known}, or the path of a coefficient file",
+        )
+    return file
+
+
+def _find_source(name: str, product: Path, key: str) -> Path:
     if name.endswith(".toml"):
         found = product.parent / name
         if found.is_file():
             return found
         raise SourceError(
             f"source '{name}' does not exist",
-            where=f"{product} anomaly.source",
+            where=f"{product} {key}",
             expected=f"a file at {found}",
             remedy="correct the path",
         )
@@ -150,7 +261,7 @@ def _find_source(name: str, product: Path) -> Path:
         return entry
     raise SourceError(
         f"the catalog has no source '{name}'",
-        where=f"{product} anomaly.source",
+        where=f"{product} {key}",
         expected="the path of a source TOML, or an id in the catalog",
         remedy="write the path with its .toml",
     )

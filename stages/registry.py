@@ -10,23 +10,31 @@ from magtiles.stages.field import (
     core_field,
     crop,
     evaluate_model,
+    model_components,
     rereference,
     voids,
 )
 from magtiles.stages.ingest import grid
 from magtiles.stages.release import tiles
+from magtiles.stages.temporal import baseline
+from magtiles.stages.vehicle.calibration import apply as apply_calibration
+from magtiles.stages.vehicle.calibration import calibrate
 
 STAGES: tuple[Stage, ...] = (
     grid.STAGE,
+    calibrate.STAGE,
+    apply_calibration.STAGE,
     evaluate_model.STAGE,
     core_field.GRID_STAGE,
     core_field.TRACK_STAGE,
     rereference.STAGE,
+    baseline.STAGE,
     crop.STAGE,
     voids.STAGE,
     carry_forward.STAGE,
     continuation.STAGE,
     components.STAGE,
+    model_components.STAGE,
     tiles.STAGE,
 )
 """In the order of the work: ingest, field, release."""

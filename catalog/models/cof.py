@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from magtiles.catalog.kernels.harmonics import count
+from magtiles.catalog.kernels.harmonics import count, position
 from magtiles.catalog.models.model import REFERENCE_RADIUS_KM, FieldModel
 from magtiles.catalog.models.rows import Line, Table, numbers, significant_lines
-from magtiles.schemas.errors import FormatError
+from magtiles.schemas.errors import FormatError, QueryError
 
 Floats = NDArray[np.float64]
 
@@ -122,23 +122,48 @@ def _coefficients(rows: list[Line], columns: int) -> tuple[int, int, Floats]:
     return n_min, n_max, table.values
 
 
-def read_emm(folder: Path) -> FieldModel:
-    """The EMM of a folder: EMM2000.COF, EMM2001.COF ... with EMM2000SV.COF ...
+def cof_text(model: FieldModel, *, made: str = "") -> str:
+    """A model as a COF file, to any degree, in the columns of the WMM: see `read_cof`.
+
+    ``n m g h`` and, where the model has secular variation, ``dg dh``; six decimals of a nT (nT/yr).
+    `made` is the date of the file in its header. Raises QueryError for a model of several epochs,
+    which the format does not know, and for a name that is not one word.
+    """
+    if len(model.epochs) != 1 or len(model.name.split()) != 1:
+        raise QueryError(
+            f"{len(model.epochs)} epochs under the name {model.name!r}",
+            where="COF",
+            expected="one epoch, and a name of one word",
+        )
+    sets = [model.coefficients[0]]
+    if model.secular_variation is not None:
+        sets.append(model.secular_variation)
+    lines = [f"{float(model.epochs[0]):>10}            {model.name:<16} {made}".rstrip()]
+    for n in range(model.n_min, model.n_max + 1):
+        for m in range(n + 1):
+            pairs = ((c[position(n, m)], c[position(n, -m)] if m else 0.0) for c in sets)
+            values = "".join(f"{value:15.6f}" for pair in pairs for value in pair)
+            lines.append(f"{n:4d} {m:4d}{values}")
+    return "\n".join([*lines, *["9" * 48] * 2]) + "\n"
+
+
+def read_emm(files: Sequence[Path], where: Path) -> FieldModel:
+    """The EMM in files EMM2000.COF, EMM2001.COF ... with EMM2000SV.COF ...; `where` names the set.
 
     The yearly files hold the lowest degrees, the last of them all; the higher degrees do not
     change. Between yearly epochs coefficients are linear, and after the last one its secular
     variation holds for five years. (NOAA's own program starts from each year with that year's
     secular variation, and so has small steps at the turn of the year.)
     """
-    found = {match[0].upper(): path for path in sorted(folder.iterdir())
+    found = {match[0].upper(): path for path in sorted(files)
              if (match := _YEARLY.fullmatch(path.name))}  # fmt: skip
     years = sorted(int(name[3:7]) for name in found if "SV" not in name)
     if not years:
-        raise FormatError("no files of the EMM", where=folder, expected="EMM2000.COF and on")
+        raise FormatError("no files of the EMM", where=where, expected="EMM2000.COF and on")
     wanted = [f"EMM{y}.COF" for y in range(years[0], years[-1] + 1)] + [f"EMM{years[-1]}SV.COF"]
     for name in wanted:
         if name not in found:
-            raise FormatError(f"{name} is missing", where=folder, remedy="fetch the whole set")
+            raise FormatError(f"{name} is missing", where=where, remedy="fetch the whole set")
     files = [_yearly(found[f"EMM{y}.COF"], y) for y in years]
     full = files[-1]
     coefficients = np.repeat(full.coefficients[None], len(files), axis=0)

@@ -15,6 +15,21 @@ def load_igrf(generation: int = 14) -> FieldModel:
 
     Raises SourceError where ppigrf is not installed, QueryError for another generation.
     """
+    found = igrf_files()
+    if generation not in found:
+        raise QueryError(
+            f"no IGRF of generation {generation}",
+            where="ppigrf",
+            expected=" or ".join(map(str, sorted(found))),
+        )
+    return read_model(found[generation])
+
+
+def igrf_files() -> dict[int, Path]:
+    """The coefficient file of each generation that ppigrf carries.
+
+    Raises SourceError where ppigrf is not installed.
+    """
     package = importlib.util.find_spec("ppigrf")  # finds it without importing it, and pandas
     if package is None or package.origin is None:
         raise SourceError(
@@ -22,14 +37,5 @@ def load_igrf(generation: int = 14) -> FieldModel:
             expected="the package ppigrf",
             remedy="pip install 'magtiles[pipeline]'",
         )
-    folder = Path(package.origin).parent
-    found = sorted(
-        int(path.stem[4:]) for path in folder.glob("IGRF*.shc") if path.stem[4:].isdigit()
-    )
-    if generation not in found:
-        raise QueryError(
-            f"no IGRF of generation {generation}",
-            where=folder,
-            expected=" or ".join(map(str, found)),
-        )
-    return read_model(folder / f"IGRF{generation}.shc")
+    files = Path(package.origin).parent.glob("IGRF*.shc")
+    return {int(file.stem[4:]): file for file in files if file.stem[4:].isdigit()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from magtiles.catalog.models.cof import is_cof, read_cof, read_emm
@@ -27,7 +28,7 @@ def read_model(path: Path | str) -> FieldModel:
     """
     path = Path(path)
     if path.is_dir():
-        return read_emm(path)
+        return read_emm(list(path.iterdir()), path)
     if path.stat().st_size > _LARGEST:
         raise FormatError("is larger than any model", where=path, expected=_FORMATS)
     data = path.read_bytes()
@@ -40,6 +41,15 @@ def read_model(path: Path | str) -> FieldModel:
     if text.startswith("WMMF-"):
         return read_geographiclib(path, significant_lines(str(path), text))
     return parse_model(text, str(path))
+
+
+def read_model_files(files: Sequence[Path]) -> FieldModel:
+    """The model in the files of a set: one file, .wmm with its .wmm.cof, or an EMM set.
+
+    Raises as `read_model`.
+    """
+    alone = files if len(files) == 1 else [f for f in files if f.suffix == ".wmm"]
+    return read_model(alone[0]) if alone else read_emm(files, files[0].parent)
 
 
 def parse_model(text: str, file: str) -> FieldModel:

@@ -13,9 +13,10 @@ import numpy as np
 from numpy.polynomial import polynomial
 from numpy.typing import NDArray
 
+from magtiles.catalog.kernels.harmonics import position
 from magtiles.catalog.models.model import REFERENCE_RADIUS_KM, FieldModel
 from magtiles.catalog.models.rows import Line, Table, numbers
-from magtiles.schemas.errors import FormatError
+from magtiles.schemas.errors import FormatError, QueryError
 
 Floats = NDArray[np.float64]
 
@@ -66,6 +67,33 @@ def read_shc(lines: list[Line]) -> FieldModel:
         None,
         valid,
     )
+
+
+def shc_text(model: FieldModel, *comments: str) -> str:
+    """A model as an SHC file with all digits, one line of comment each before the header.
+
+    Secular variation after the last epoch becomes one more epoch, at the end of the validity.
+    Raises QueryError for a model of one epoch that is not valid always: the format takes a file
+    with one time for static.
+    """
+    epochs, coefficients = model.epochs, model.coefficients
+    if model.secular_variation is not None and model.valid[1] > epochs[-1]:
+        later = coefficients[-1] + (model.valid[1] - epochs[-1]) * model.secular_variation
+        epochs, coefficients = np.append(epochs, model.valid[1]), np.vstack([coefficients, later])
+    span = "" if len(epochs) == 1 else f" {float(model.valid[0])!r} {float(model.valid[1])!r}"
+    if len(epochs) == 1 and np.isfinite(model.valid).any():
+        raise QueryError(
+            f"is valid at {epochs[0]:g} only", where=model.name, expected="several epochs in SHC"
+        )
+    order, steps = (2, 1) if len(epochs) > 1 else (1, 1)
+    lines = [f"# {comment}" for comment in comments]
+    lines.append(f"{model.n_min} {model.n_max} {len(epochs)} {order} {steps}{span}")
+    lines.append(" ".join(repr(float(epoch)) for epoch in epochs))
+    for n in range(model.n_min, model.n_max + 1):
+        for m in (0, *(sign * m for m in range(1, n + 1) for sign in (1, -1))):
+            values = " ".join(repr(float(value)) for value in coefficients[:, position(n, m)])
+            lines.append(f"{n} {m} {values}")
+    return "\n".join(lines) + "\n"
 
 
 def _header(line: Line) -> tuple[int, int, int, int, int]:

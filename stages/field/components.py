@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from magtiles.catalog.flags import QualityFlag, flag_attributes
+from magtiles.catalog.flags import QualityFlag
 from magtiles.schemas.errors import ContractError, CoverageError, ParameterError
-from magtiles.stages.crs import WGS84
 from magtiles.stages.declare import Params, Stage, quantity
 from magtiles.stages.field.direction import Ambient, AmbientSource
 from magtiles.stages.field.interpolate import evaluate_linear, evaluate_spline
+from magtiles.stages.field.level import PRODUCTS, assemble_level, wgs84_variable
 from magtiles.stages.field.padding import plan_padding
 from magtiles.stages.field.prepare import PlaneMap, prepare
 from magtiles.stages.field.reuse import content_key, latest
@@ -29,15 +27,6 @@ from magtiles.stages.field.uncertainty import uncertainty
 
 Single = NDArray[np.float32]
 
-PRODUCTS = (
-    "magnetic_anomaly", "anomaly_north", "anomaly_east", "anomaly_down",
-    "gradient_nn", "gradient_ne", "gradient_nd", "gradient_ee", "gradient_ed",
-)  # fmt: skip
-SIGMAS = {
-    "magnetic_anomaly_uncertainty": "total",
-    "vector_uncertainty": "vector",
-    "tensor_uncertainty": "tensor",
-}
 _OVERSAMPLING = 2
 _DROPPED = ("datum_pipeline", "datum_operation", "datum_accuracy_m", "allow_ballpark_datum")
 
@@ -168,39 +157,19 @@ def _assemble(
     sigmas: dict[str, NDArray[np.float64]],
     flags: NDArray[np.uint8],
 ) -> xr.Dataset:
-    dims = target.dims
-
-    def field(values: NDArray[Any], units: str) -> tuple[Any, ...]:
-        return dims, values.astype(np.float32, copy=False), {"units": units, "grid_mapping": "crs"}
-
-    variables: dict[str, Any] = {
-        name: field(values, "nT km-1" if name.startswith("gradient") else "nT")
-        for name, values in zip(PRODUCTS, products, strict=True)
-    }
-    for name, group in SIGMAS.items():
-        variables[name] = field(_rounded(sigmas[group]), "nT km-1" if group == "tensor" else "nT")
-    for axis, values in zip(("north", "east", "down"), nodes.ambient, strict=True):
-        variables[f"ambient_{axis}"] = field(values, "1")
-    variables["quality_flag"] = (dims, flags, flag_attributes() | {"grid_mapping": "crs"})
+    planar = target.dims[0] == "y"
     height = grid["height"]
-    variables["height"] = ((), float(height) + height_gain, height.attrs)
-    variables["crs"] = grid["crs"] if dims[0] == "y" else ((), np.int32(0), WGS84.to_cf())
-    units = ("m", "m") if dims[0] == "y" else ("degrees_north", "degrees_east")
-    coordinates = {
-        name: ((name,), values, {"units": unit})
-        for name, values, unit in zip(dims, (target.rows, target.columns), units, strict=True)
-    }
-    middle = Ambient(*(np.asarray(part.mean(dtype=float)) for part in nodes.ambient))
-    attributes = {k: v for k, v in grid.attrs.items() if k not in _DROPPED or dims[0] == "y"}
-    attributes["ambient_inclination_deg"] = float(middle.inclination_deg)
-    attributes["ambient_declination_deg"] = float(middle.declination_deg)
-    return xr.Dataset(variables, coords=coordinates, attrs=attributes)
-
-
-def _rounded(sigma: NDArray[np.float64]) -> Single:
-    """Sigma to three digits (eleven bits): more would say nothing, and not compress."""
-    bits = sigma.astype(np.float32).view(np.uint32)
-    return ((bits + np.uint32(1 << 12)) & np.uint32(0xFFFFE000)).view(np.float32)
+    return assemble_level(
+        target.dims,
+        (target.rows, target.columns),
+        products,
+        sigmas,
+        Ambient(*nodes.ambient),
+        flags,
+        height=xr.Variable((), float(height) + height_gain, height.attrs),
+        crs=grid["crs"].variable if planar else wgs84_variable(),
+        attributes={k: v for k, v in grid.attrs.items() if k not in _DROPPED or planar},
+    )
 
 
 STAGE = Stage(

@@ -22,13 +22,16 @@ _MOST_NODES = 500_000_000
 """A level's nine arrays of so many nodes are 18 GB: what asks for more is a slip of the unit."""
 
 
-def plan_lattice(bounds: Bounds, spacing_m: float, tile_deg: float | None = None) -> Lattice:
+def plan_lattice(
+    bounds: Bounds, spacing_m: float, tile_deg: float | None = None, *, table: str = "anomaly"
+) -> Lattice:
     """The lattice of nodes at most `spacing_m` apart that covers `bounds`.
 
     Spacing is uniform in degrees, and such that `tile_deg` holds whole cells; tiles count from
     the south-west corner. East-west cells are sized where the region is widest.
     Raises CoverageError beyond 85 degrees, where north and east turn too fast for a spline,
-    ParameterError for a tile smaller than a few cells and for too many nodes.
+    ParameterError for a tile smaller than a few cells, for tiles that do not meet around the
+    globe, and for too many nodes, naming the key of the product's `table`.
     """
     south, north, west, east = bounds
     if max(abs(south), abs(north)) > POLAR_LIMIT:
@@ -48,16 +51,23 @@ def plan_lattice(bounds: Bounds, spacing_m: float, tile_deg: float | None = None
     if min(cells) <= 2 * HALO:
         raise ParameterError(
             f"tiles of {tile_deg:g} degrees hold {min(cells)} cells of {spacing_m:g} m",
-            where="anomaly.tile_deg",
+            where=f"{table}.tile_deg",
             expected=f"more than {2 * HALO} cells",
             remedy="raise tile_deg or lower spacing_m",
         )
     step_lat, step_lon = tile_deg / cells[0], tile_deg / cells[1]
+    around = 360.0 / tile_deg
+    if east - west >= 360.0 and abs(around - round(around)) > 1e-9:
+        raise ParameterError(
+            f"tiles of {tile_deg:g} degrees do not divide the circle",
+            where=f"{table}.tile_deg",
+            expected="a divisor of 360 for a region all around",
+        )
     nodes = (north - south) / step_lat * (east - west) / step_lon
     if nodes > _MOST_NODES:
         raise ParameterError(
             f"nodes {spacing_m:g} m apart are {nodes:.2g} a level",
-            where="anomaly.spacing_m",
+            where=f"{table}.spacing_m",
             expected=f"at most {_MOST_NODES:.0e}",
             remedy="raise spacing_m, or set a smaller region",
         )

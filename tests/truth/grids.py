@@ -10,7 +10,7 @@ import xarray as xr
 from known import Field, Floats
 
 from magtiles.pipeline.sample import Sample
-from magtiles.stages.field.components import PRODUCTS
+from magtiles.stages.field.level import PRODUCTS
 
 
 def grid_of(

@@ -13,12 +13,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from magtiles.pipeline.sample import DEMO, Sample, synthesize, write_survey
-from magtiles.stages.field.components import (
-    PRODUCTS,
-    SIGMAS,
-    DeriveComponentsParams,
-    derive_components,
-)
+from magtiles.stages.field.components import DeriveComponentsParams, derive_components
+from magtiles.stages.field.level import PRODUCTS, SIGMAS
 from magtiles.stages.field.voids import FillVoidsParams, fill_voids
 from magtiles.stages.ingest.grid import STAGE as INGEST
 

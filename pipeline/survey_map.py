@@ -1,0 +1,156 @@
+"""The map of a survey: ingested, cropped, filled, and continued to every level."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from magtiles.catalog.releases.lattice import Lattice
+from magtiles.pipeline import receipts
+from magtiles.pipeline.artifacts import open_artifact
+from magtiles.pipeline.product import AnomalyTable, SurveyMap
+from magtiles.pipeline.steps import MapPlan, Steps, node_axes
+from magtiles.schemas.errors import CoverageError
+from magtiles.stages.field import components, crop, voids
+from magtiles.stages.field.direction import reference_coefficients
+from magtiles.stages.field.extent import data_bounds
+from magtiles.stages.field.geometry import true_spacing
+from magtiles.stages.ingest import grid as ingest
+from magtiles.stages.release.plan import Bounds, plan_lattice
+
+_MARGIN_HEIGHTS = 20.0
+_MARGIN_CELLS = 64
+_LEAST_GAP_M = 1.0
+
+
+@dataclass(frozen=True)
+class Survey:
+    """A survey ready to be continued: where its grid lies, its surface and its cell (m)."""
+
+    grid: Path
+    height_m: float
+    cell_m: float
+    bounds: Bounds
+    reference_field: str
+
+
+def plan_survey_map(source: SurveyMap, folder: Path, data: Path | None, steps: Steps) -> MapPlan:
+    """Make the survey ready and plan its lattice and levels.
+
+    Raises SourceError, FormatError and ContractError for bad data; CoverageError for levels
+    below the survey or too close.
+    """
+    wanted, files = source.table, _data_files(source, data)
+    survey = _survey(wanted, [source.path, *files], folder, steps)
+    heights = _heights(wanted, survey.height_m)
+    spacing = wanted.spacing_m or _default_spacing(survey, heights)
+    lattice = plan_lattice(survey.bounds, spacing, wanted.tile_deg)
+    names = ["survey.nc", *(["cropped.nc"] if wanted.region is not None else []), "filled.nc"]
+    return MapPlan(
+        lattice=lattice,
+        heights=heights,
+        level=lambda height: _level(wanted, survey, lattice, height, folder, steps),
+        artifacts=[folder / name for name in names],
+        inputs=_inputs(source, files),
+        source=source.path,
+        core_field=reference_coefficients(survey.reference_field),
+    )
+
+
+def _data_files(source: SurveyMap, data: Path | None) -> list[Path]:
+    """The source's data files: in `data` where it is given, else beside the source TOML."""
+    if data is None:
+        return list(source.source.files)
+    return [data / file.name for file in source.source.files]
+
+
+def _inputs(source: SurveyMap, files: Sequence[Path]) -> list[dict[str, str]]:
+    header = source.source.source
+    return [
+        {
+            "id": f"{header.id}/{file.name}" if len(files) > 1 else header.id,
+            "sha256": receipts.digest(file),
+            "licence": header.licence,
+            "role": "survey",
+        }
+        for file in files
+    ]
+
+
+def _survey(wanted: AnomalyTable, files: Sequence[Path], folder: Path, steps: Steps) -> Survey:
+    """Ingest, crop and fill."""
+    grid = steps.run(ingest.STAGE, {"files": files}, folder / "survey.nc", {})
+    with open_artifact(grid) as opened:
+        height, cell = float(np.mean(opened["height"])), min(true_spacing(opened))
+        reference_field = str(opened.attrs["reference_field"])
+    region = wanted.region
+    if region is not None:
+        gain = max(abs(h - height) for h in wanted.heights_m)
+        margin = max(_MARGIN_HEIGHTS * gain, _MARGIN_CELLS * cell)
+        limits = {"latitude": region.latitude, "longitude": region.longitude, "margin_m": margin}
+        grid = steps.run(crop.STAGE, {"grid": grid}, folder / "cropped.nc", limits)
+        bounds = region.bounds
+    else:
+        with open_artifact(grid) as opened:
+            bounds = data_bounds(opened)
+    filled = steps.run(voids.STAGE, {"grid": grid}, folder / "filled.nc", {})
+    return Survey(filled, height, cell, bounds, reference_field)
+
+
+def _heights(wanted: AnomalyTable, survey_height: float) -> list[float]:
+    """The levels, ascending, the survey's own surface among them."""
+    below = [h for h in wanted.heights_m if h < survey_height]
+    if below and not wanted.allow_downward_continuation:
+        raise CoverageError(
+            f"heights_m holds {min(below):g}, below the survey at {survey_height:g} m",
+            where="anomaly",
+            expected=f"heights of {survey_height:g} m and more",
+            remedy="raise it, or set allow_downward_continuation = true (flagged, noisier)",
+        )
+    heights = sorted({survey_height, *wanted.heights_m})
+    check_gaps(heights, "anomaly heights_m", ", the survey's own among them")
+    return heights
+
+
+def check_gaps(heights: Sequence[float], where: str, note: str = "") -> None:
+    """Raise CoverageError for ascending levels that are too close to interpolate between."""
+    for lower, upper in itertools.pairwise(heights):
+        if upper - lower < _LEAST_GAP_M:
+            raise CoverageError(
+                f"levels at {lower:.12g} and {upper:.12g} m are too close to interpolate between",
+                where=where,
+                expected=f"levels {_LEAST_GAP_M:g} m apart or more{note}",
+                remedy="leave one out",
+            )
+
+
+def _default_spacing(survey: Survey, heights: Sequence[float]) -> float:
+    """The smaller of the source's cell and half the lowest gain above zero."""
+    gains = [h - survey.height_m for h in heights if h > survey.height_m]
+    return min([survey.cell_m, *(g / 2 for g in gains)])
+
+
+def _level(
+    wanted: AnomalyTable,
+    survey: Survey,
+    lattice: Lattice,
+    height: float,
+    folder: Path,
+    steps: Steps,
+) -> Path:
+    """The component grid of one level on every node of the lattice, halo included."""
+    params: dict[str, Any] = {
+        "height_m": height - survey.height_m,
+        "allow_downward_continuation": wanted.allow_downward_continuation,
+        **node_axes(lattice),
+    }
+    for angle in ("inclination_deg", "declination_deg"):
+        if (value := getattr(wanted, angle)) is not None:
+            params[angle] = value
+    out = folder / f"level-{height:.12g}m.nc"
+    return steps.run(components.STAGE, {"grid": survey.grid}, out, params)
