@@ -33,6 +33,8 @@ difference is 64 G.
 """
 WEAKEST_CORE_FIELD_NT = 22_000.0
 """Least intensity at the Earth's surface, in the South Atlantic anomaly."""
+FASTEST_TURN_PER_KM = 2.2e-4
+"""Radians that the core field turns by in a kilometre of height, at most (2.0e-4 in 2025)."""
 
 # Component and direction to the tensor's names: derivative of B_i along north, then east.
 _PAIRS = {
@@ -170,12 +172,18 @@ def _core(values: NDArray[Any], halo: int) -> NDArray[Any]:
 
 
 def projection_excess(
-    level: Mapping[str, NDArray[Any]], ambient: Mapping[str, NDArray[Any]], halo: int
+    level: Mapping[str, NDArray[Any]],
+    ambient: Mapping[str, NDArray[Any]],
+    halo: int,
+    rise_km: float,
 ) -> Floats:
     """By how much the vector along the ambient field misses the total beyond its bound, nT.
 
-    |f . B - T| - |B across f|^2 / 2F at the core nodes without any flag: the anomaly of the
-    magnitude is f . B to second order (Blakely 1995, section 8.2), with F the weakest field.
+    Core nodes without any flag, of a level `rise_km` above the lowest. The total may be the
+    projection f . B itself, as a survey's transform gives it, or the magnitude's own change
+    |C + B| - |C|, as a field model's: with a the part of B across the core field C, they differ by
+    a^2 / (|C + B| + |C| + f . B) exactly, less than a^2 / 2 (F + f . B) with F the weakest field.
+    `ambient` is the direction at the lowest level, from which the core field turns upward.
     """
     north, east, down = (
         np.asarray(level[f"anomaly_{a}"], np.float64) for a in ("north", "east", "down")
@@ -186,7 +194,9 @@ def projection_excess(
         + ambient["ambient_down"] * down
     )
     across2 = np.maximum(north**2 + east**2 + down**2 - along**2, 0.0)
-    miss = np.abs(along - level["magnetic_anomaly"]) - across2 / (2.0 * WEAKEST_CORE_FIELD_NT)
+    bent = across2 / (2.0 * (WEAKEST_CORE_FIELD_NT + np.minimum(along, 0.0)))
+    turned = FASTEST_TURN_PER_KM * rise_km * np.sqrt(across2)
+    miss = np.abs(along - level["magnetic_anomaly"]) - bent - turned
     clean: NDArray[np.bool_] = _core(level["quality_flag"], halo) == 0
     excess: Floats = _core(miss, halo)[clean]
     return excess

@@ -196,7 +196,8 @@ class _Findings:
             height,
             HALO,
         )
-        excess = projection_excess(at_level, arrays, HALO)
+        rise_km = (self._manifest.heights_m[level] - self._manifest.heights_m[0]) / 1000.0
+        excess = projection_excess(at_level, arrays, HALO, rise_km)
         if excess.size:
             self._excess[level].append(float(excess.max()))
 
@@ -273,5 +274,5 @@ def _projection_check(height: float, excess: list[float]) -> Check:
         worst,
         PROJECTION_TOLERANCE_NT,
         "nT",
-        "largest miss of the total beyond |across|^2 / 2F, nodes without flags",
+        "largest miss of the total beyond |across|^2 / 2F and the turn of f, nodes without flags",
     )

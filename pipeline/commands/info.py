@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from magtiles.pipeline.output import print_json, print_table
 
 if TYPE_CHECKING:
+    from magtiles.catalog.releases.lattice import Lattice
     from magtiles.catalog.releases.manifest import Manifest
 
 HELP = "say what a release holds"
@@ -53,7 +54,7 @@ def describe(manifest: Manifest) -> dict[str, Any]:
         "identity": dict(manifest.identity),
         "coverage": {
             "latitude": [lattice.south, lattice.north],
-            "longitude": [_wrapped(lattice.west), _wrapped(lattice.east)],
+            "longitude": _longitudes(lattice),
         },
         "spacing_deg": [lattice.latitude_spacing, lattice.longitude_spacing],
         "nodes": [lattice.rows + 1, lattice.columns + 1],
@@ -66,6 +67,12 @@ def describe(manifest: Manifest) -> dict[str, Any]:
         "inputs": [{"id": i.id, "licence": i.licence, "role": i.role} for i in manifest.inputs],
         "manifest_digest": manifest.manifest_digest,
     }
+
+
+def _longitudes(lattice: Lattice) -> list[float]:
+    if lattice.east - lattice.west > 360.0 - 1e-9:
+        return [-180.0, 180.0]
+    return [_wrapped(lattice.west), _wrapped(lattice.east)]
 
 
 def _wrapped(longitude: float) -> float:

@@ -28,7 +28,7 @@ def plan_lattice(
     """The lattice of nodes at most `spacing_m` apart that covers `bounds`.
 
     Spacing is uniform in degrees, and such that `tile_deg` holds whole cells; tiles count from
-    the south-west corner. East-west cells are sized where the region is widest.
+    the south-west corner. The outermost row never lies beyond 85 degrees. East-west cells are sized where the region is widest.
     Raises CoverageError beyond 85 degrees, where north and east turn too fast for a spline,
     ParameterError for a tile smaller than a few cells, for tiles that do not meet around the
     globe, and for too many nodes, naming the key of the product's `table`.
@@ -71,16 +71,16 @@ def plan_lattice(
             expected=f"at most {_MOST_NODES:.0e}",
             remedy="raise spacing_m, or set a smaller region",
         )
-    first_row, first_column = (
-        math.floor(south / step_lat + 1e-9),
-        math.floor(west / step_lon + 1e-9),
-    )
+    highest = math.floor(POLAR_LIMIT / step_lat + 1e-9)
+    first_row = max(math.floor(south / step_lat + 1e-9), -highest)
+    last_row = min(math.ceil(north / step_lat - 1e-9), highest)
+    first_column = math.floor(west / step_lon + 1e-9)
     return Lattice(
         south=first_row * step_lat,
         west=first_column * step_lon,
         latitude_spacing=step_lat,
         longitude_spacing=step_lon,
-        rows=max(1, math.ceil(north / step_lat - 1e-9) - first_row),
+        rows=max(1, last_row - first_row),
         columns=max(1, math.ceil(east / step_lon - 1e-9) - first_column),
         tile_rows=cells[0],
         tile_columns=cells[1],

@@ -147,19 +147,19 @@ def test_projection_bound_holds_for_a_magnetometer() -> None:
     core = 45_000.0 * DOWN
     level["magnetic_anomaly"] = np.linalg.norm(core + vector, axis=-1) - np.linalg.norm(core)
     along = ambient(DOWN, vector.shape[:2])
-    excess = projection_excess(level, along, HALO)
+    excess = projection_excess(level, along, HALO, 0.0)
     assert excess.size == 40 * 32
     assert excess.max() <= 1e-9
     linear = np.abs(vector @ DOWN - level["magnetic_anomaly"]).max()
     assert linear > 1.0  # so the bound did something
     level["magnetic_anomaly"] = 2.0 * level["magnetic_anomaly"]
-    assert projection_excess(level, along, HALO).max() > 10.0
+    assert projection_excess(level, along, HALO, 0.0).max() > 10.0
 
 
 def test_projection_looks_at_clean_nodes_only() -> None:
     level, *_ = exact_level(2500.0)
     level["magnetic_anomaly"][30, 30] += 500.0
     along = ambient(DOWN, level["magnetic_anomaly"].shape)
-    assert projection_excess(level, along, HALO).max() > 400.0
+    assert projection_excess(level, along, HALO, 0.0).max() > 400.0
     level["quality_flag"][30, 30] = QualityFlag.VOID_FILLED
-    assert projection_excess(level, along, HALO).max() < 1e-9
+    assert projection_excess(level, along, HALO, 0.0).max() < 1e-9
