@@ -16,7 +16,7 @@ from magtiles.stages.field import (
 )
 from magtiles.stages.ingest import grid
 from magtiles.stages.release import tiles
-from magtiles.stages.temporal import baseline
+from magtiles.stages.temporal import assemble, baseline
 from magtiles.stages.vehicle.calibration import apply as apply_calibration
 from magtiles.stages.vehicle.calibration import calibrate
 
@@ -29,6 +29,7 @@ STAGES: tuple[Stage, ...] = (
     core_field.TRACK_STAGE,
     rereference.STAGE,
     baseline.STAGE,
+    assemble.STAGE,
     crop.STAGE,
     voids.STAGE,
     carry_forward.STAGE,
