@@ -14,20 +14,24 @@ from magtiles.stages.field import (
     rereference,
     voids,
 )
-from magtiles.stages.ingest import grid
+from magtiles.stages.ingest import grid, index
+from magtiles.stages.ingest.observatory import stage as observatory
 from magtiles.stages.release import tiles
-from magtiles.stages.temporal import assemble, baseline
+from magtiles.stages.temporal import assemble, baseline, check
 from magtiles.stages.vehicle.calibration import apply as apply_calibration
 from magtiles.stages.vehicle.calibration import calibrate
 
 STAGES: tuple[Stage, ...] = (
     grid.STAGE,
+    observatory.STAGE,
+    index.STAGE,
     calibrate.STAGE,
     apply_calibration.STAGE,
     evaluate_model.STAGE,
     core_field.GRID_STAGE,
     core_field.TRACK_STAGE,
     rereference.STAGE,
+    check.STAGE,
     baseline.STAGE,
     assemble.STAGE,
     crop.STAGE,

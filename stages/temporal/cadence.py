@@ -21,6 +21,7 @@ from magtiles.schemas.errors import ParameterError
 Real = NDArray[np.float64]
 Flags = NDArray[np.uint8]
 Cadence = Literal["minute", "hour"]
+MinuteFilter = Literal["intermagnet", "usgs"]
 
 SECONDS = {"minute": 60, "hour": 3600}
 
@@ -33,7 +34,9 @@ _BLOCK = 4096  # outputs filtered at once
 _ELEMENTS = ("field_north", "field_east", "field_down", "field_total")
 
 
-def reduce_cadence(series: xr.Dataset, cadence: Cadence) -> xr.Dataset:
+def reduce_cadence(
+    series: xr.Dataset, cadence: Cadence, minute_filter: MinuteFilter = "intermagnet"
+) -> xr.Dataset:
     """An observatory-series/1 at one minute or one hour, from a finer one; else as it is.
 
     A value made of less than all its samples carries INCOMPLETE_AVERAGE, and is NaN below 90 %.
@@ -50,15 +53,19 @@ def reduce_cadence(series: xr.Dataset, cadence: Cadence) -> xr.Dataset:
             expected="a record of one-second or one-minute values",
         )
     if found == 1.0:
-        series = _filtered(series, gaussian_filter(), every=60, phase=0)
+        series = _filtered(series, gaussian_filter(minute_filter), every=60, phase=0)
     if cadence == "hour":
         series = _filtered(series, np.full(60, 1.0 / 60.0), every=60, phase=30)
     return series
 
 
-def gaussian_filter() -> Real:
-    """Weights (91,) of the one-minute filter, of sum 1."""
-    weights: Real = windows.gaussian(_TAPS, _GAUSSIAN_S)
+def gaussian_filter(kind: MinuteFilter = "intermagnet") -> Real:
+    """Weights (91,) of the one-minute filter, of sum 1.
+
+    INTERMAGNET's is centred on the minute. The USGS's values since 2020 are of the first 91 of
+    92 points (SciPy's `get_window` makes periodic windows), centred half a second later.
+    """
+    weights: Real = windows.gaussian(_TAPS, _GAUSSIAN_S, sym=kind == "intermagnet")
     return weights / weights.sum()
 
 

@@ -75,6 +75,11 @@ class IngestObservatoryParams(Params):
     cadence: Literal["minute", "hour"] | None = quantity(
         "1", default=None, doc="Reduce to minute or hourly values; default: as recorded."
     )
+    minute_filter: Literal["intermagnet", "usgs"] = quantity(
+        "1",
+        default="intermagnet",
+        doc="Filter from seconds to minutes: INTERMAGNET's, or the USGS's, half a second later.",
+    )
 
 
 OBSERVATORY_SERIES = SourceKind("observatory-series", "series", IngestObservatoryParams)
@@ -105,7 +110,9 @@ def ingest_observatory(files: Sequence[Path], *, params: IngestObservatoryParams
     combined = combine(records, fields)
     name = paths[0].name if source is None else source.source.id
     series = _dataset(combined, _attrs(records, fields, station, params, name))
-    return reduce_cadence(series, params.cadence) if params.cadence is not None else series
+    if params.cadence is None:
+        return series
+    return reduce_cadence(series, params.cadence, params.minute_filter)
 
 
 STAGE = Stage(
