@@ -40,11 +40,11 @@ class CheckObservatoryParams(Params):
         "1", default="IGRF-14", min_length=1, doc="Core field model to compare the level with."
     )
     spike_threshold: float = quantity(
-        "1", default=12.0, gt=0, doc="Least size of a spike, in local scales of differences."
+        "1", default=8.0, gt=0, doc="Least size of a spike, in local scales of differences."
     )
     spike_floor_nt: float = quantity("nT", default=2.0, ge=0, doc="Least size of a spike.")
     step_threshold: float = quantity(
-        "1", default=20.0, gt=0, doc="Least height of a step, in local scales of differences."
+        "1", default=10.0, gt=0, doc="Least height of a step, in local scales of differences."
     )
     step_floor_nt: float = quantity("nT", default=3.0, ge=0, doc="Least height of a step.")
     stuck_samples: int = quantity(
@@ -54,7 +54,7 @@ class CheckObservatoryParams(Params):
         "1", default=10.0, gt=0, doc="Scalar against vector: deviation from the day, in sigma."
     )
     total_floor_nt: float = quantity(
-        "nT", default=2.0, ge=0, doc="Scalar against vector: least deviation from the day."
+        "nT", default=3.0, ge=0, doc="Scalar against vector: least deviation from the day."
     )
     level_tolerance_nt: float = quantity(
         "nT", default=1000.0, gt=0, doc="What the crust may add to the core field."
