@@ -39,7 +39,7 @@ $(RELEASES): release/%: % $(READY)
 	@built=$$($(MAGTILES) build $* --store $(STORE) --json) && \
 	  $(MAGTILES) validate "$$(printf '%s' "$$built" | $(PATH_OF))"
 
-build/sample/demo.toml: pipeline/sample.py catalog/kernels/dipole.py $(READY)
+build/sample/demo.toml build/sample/world.toml: pipeline/sample.py pipeline/sample_model.py $(READY)
 	$(MAGTILES) sample $(@D)
 
 test: $(READY) ## Run the tests

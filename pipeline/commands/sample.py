@@ -1,11 +1,11 @@
-"""Write the synthetic sample survey with its exact truth and its TOML files."""
+"""Write the synthetic samples: a survey with its exact truth, and a field model, with TOML files."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-HELP = "write the synthetic sample survey and its truth"
+HELP = "write the synthetic survey, its truth, and a synthetic field model"
 NEEDS_PIPELINE = True
 
 
@@ -15,9 +15,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write the sample and list its files."""
+    """Write the samples and list their files."""
     from magtiles.pipeline.sample import write_sample
+    from magtiles.pipeline.sample_model import write_world
 
-    for path in write_sample(arguments.folder):
+    for path in [*write_sample(arguments.folder), *write_world(arguments.folder)]:
         print(path)
     return 0
