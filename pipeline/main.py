@@ -41,6 +41,7 @@ _EXTRA = (
     "h5py",
     "harmonica",
     "jsonschema",
+    "lz4",
     "matplotlib",
     "mcap",
     "pandas",
@@ -52,6 +53,7 @@ _EXTRA = (
     "rich",
     "scipy",
     "xarray",
+    "zstandard",
 )
 _NEGATIVE_NUMBERS = re.compile(r"-\.?\d[-+.,\deE]*")
 

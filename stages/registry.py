@@ -15,6 +15,7 @@ from magtiles.stages.field import (
     voids,
 )
 from magtiles.stages.ingest import grid, index
+from magtiles.stages.ingest.log import stage as log
 from magtiles.stages.ingest.observatory import stage as observatory
 from magtiles.stages.release import tiles
 from magtiles.stages.temporal import assemble, baseline, check
@@ -25,6 +26,7 @@ STAGES: tuple[Stage, ...] = (
     grid.STAGE,
     observatory.STAGE,
     index.STAGE,
+    log.STAGE,
     calibrate.STAGE,
     apply_calibration.STAGE,
     evaluate_model.STAGE,

@@ -82,18 +82,18 @@ def positions_at(time: Times, fixes: Fixes, *, max_gap_s: float) -> Positions:
     flag = np.zeros(time.size, dtype=np.uint16)
     place = np.full((3, time.size), np.nan)
     if not good.any():
-        return Positions(*place, flag | np.uint16(TrackFlag.NO_FIX))
+        return Positions(place[0], place[1], place[2], flag | np.uint16(TrackFlag.NO_FIX))
     at = fixes.time[good]
     outside = (time < at[0]) | (time > at[-1])
-    after = np.clip(np.searchsorted(at, time), 1, max(at.size - 1, 1)) % at.size
+    after = np.minimum(np.maximum(np.searchsorted(at, time), 1), at.size - 1)
     before = np.maximum(after - 1, 0)
     after[time == at[before]] = before[time == at[before]]  # on a fix no gap matters
     before[time == at[after]] = after[time == at[after]]
     wide = _seconds(at[after] - at[before]) > max_gap_s
     refusals = np.concatenate([[0], np.cumsum(~good)])[np.searchsorted(fixes.time, at)]
     lost = wide & (refusals[after] > refusals[before])
-    flag[outside | lost] |= TrackFlag.NO_FIX
-    flag[wide & ~lost & ~outside] |= TrackFlag.POSITION_GAP
+    flag[outside | lost] |= TrackFlag.NO_FIX.value
+    flag[wide & ~lost & ~outside] |= TrackFlag.POSITION_GAP.value
     known = ~(outside | wide)
     turns = np.degrees(np.unwrap(np.radians(fixes.longitude[good])))
     for row, values in zip(place, (fixes.latitude[good], turns, fixes.height[good]), strict=True):
@@ -149,7 +149,7 @@ def moved_by_lever(positions: Positions, quaternion: Real, lever_arm_m: Real) ->
         positions.latitude, np.nan_to_num(positions.height)
     )
     flag = positions.flag.copy()
-    flag[placed & ~known] |= TrackFlag.POSITION_GAP
+    flag[placed & ~known] |= TrackFlag.POSITION_GAP.value
     return Positions(
         positions.latitude + north / per_latitude,
         wrap_longitude(positions.longitude + east / per_longitude),

@@ -1,0 +1,48 @@
+"""Which format a log has, by its first bytes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from magtiles.schemas.errors import FormatError
+
+_MAGIC = {
+    b"\x89MCAP0\r\n": "mcap",
+    b"ULog\x01\x125": "ulog",
+}
+_KNOWN_OTHERS = {
+    b"\x28\xb5\x2f\xfd": "zstd-compressed",
+    b"\x04\x22\x4d\x18": "lz4-compressed",
+    b"\x1f\x8b": "gzip-compressed",
+    b"PK\x03\x04": "a zip archive",
+    b"SQLite format 3": "an SQLite database, as older ROS 2 bags are",
+    b"#ROSBAG": "a ROS 1 bag",
+}
+_HEAD_BYTES = 4096
+
+
+def log_format(path: Path) -> str:
+    """The name of the format. Raises FormatError for what is no log, empty or unreadable."""
+    if path.is_dir():
+        raise FormatError("is a folder", where=path, expected="a log file")
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+    except FileNotFoundError:
+        raise FormatError(
+            "the file does not exist", where=path, remedy="fetch it or correct the path"
+        ) from None
+    except OSError as caught:
+        raise FormatError(f"cannot be read: {caught.strerror}", where=path) from None
+    if not head:
+        raise FormatError("the file is empty", where=path, remedy="fetch it again")
+    for magic, name in _MAGIC.items():
+        if head.startswith(magic):
+            return name
+    other = next((text for magic, text in _KNOWN_OTHERS.items() if head.startswith(magic)), None)
+    raise FormatError(
+        f"is {other}" if other else f"starts with {head[:8]!r}",
+        where=f"{path} byte 0",
+        expected="MCAP or ULog",
+        remedy="unpack or convert it first",
+    )
