@@ -1,0 +1,1 @@
+"""Tolles-Lawson compensation: taking an aircraft off what its scalar magnetometer measures."""
