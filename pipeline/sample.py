@@ -12,6 +12,7 @@ import rasterio.io
 import xarray as xr
 
 from magtiles.catalog.kernels.dipole import TENSOR
+from magtiles.pipeline.sample_aircraft import write_flight
 from magtiles.pipeline.synthetic import DEMO, ConstantField, Sample, SampleSpec, synthesize
 from magtiles.stages.release.atomic import atomic_path
 
@@ -33,7 +34,7 @@ def write_sample(folder: Path, spec: SampleSpec = DEMO) -> list[Path]:
     """Write survey, source TOML, product TOML and truth of a spec; the same bytes every time.
 
     Returns the paths ``<name>-survey.tif``, ``<name>-survey.toml``, ``<name>.toml`` and
-    ``<name>-truth.nc``. Existing files are replaced whole.
+    ``<name>-truth.nc``, then those of `write_flight`. Existing files are replaced whole.
     """
     sample = synthesize(spec)
     paths = write_survey(folder, sample)
@@ -46,7 +47,7 @@ def write_sample(folder: Path, spec: SampleSpec = DEMO) -> list[Path]:
     }
     with atomic_path(truth) as temporary:
         dataset.to_netcdf(temporary, engine="netcdf4", format="NETCDF4", encoding=encoding)
-    return [*paths, truth]
+    return [*paths, truth, *write_flight(folder, sample)]
 
 
 def write_survey(folder: Path, sample: Sample) -> list[Path]:
