@@ -17,10 +17,12 @@ from magtiles.stages.field import (
 from magtiles.stages.ingest import grid, index
 from magtiles.stages.ingest.log import stage as log
 from magtiles.stages.ingest.observatory import stage as observatory
-from magtiles.stages.release import tiles
+from magtiles.stages.release import expect_total, tiles
 from magtiles.stages.temporal import assemble, baseline, check
 from magtiles.stages.vehicle.calibration import apply as apply_calibration
 from magtiles.stages.vehicle.calibration import calibrate
+from magtiles.stages.vehicle.tolles_lawson import apply as apply_tolles_lawson
+from magtiles.stages.vehicle.tolles_lawson import fit as fit_tolles_lawson
 
 STAGES: tuple[Stage, ...] = (
     grid.STAGE,
@@ -29,6 +31,9 @@ STAGES: tuple[Stage, ...] = (
     log.STAGE,
     calibrate.STAGE,
     apply_calibration.STAGE,
+    expect_total.STAGE,
+    fit_tolles_lawson.STAGE,
+    apply_tolles_lawson.STAGE,
     evaluate_model.STAGE,
     core_field.GRID_STAGE,
     core_field.TRACK_STAGE,
