@@ -27,6 +27,8 @@ Real = NDArray[np.float64]
 NO_REFERENCE = "none"
 """`reference_field` of a grid from which no core field was removed: the total field itself."""
 
+_LESS_DIURNAL = ", less the diurnal variation"
+
 _WEAKEST_NT = 10_000.0
 """Below the weakest core field anywhere up to 1000 km, some 15,000 nT."""
 
@@ -163,11 +165,12 @@ def remove_from_track(
     """The total-field anomaly (time,) along a track, nT.
 
     The core field is that of each sample's own date, place and height; its magnitude is kept
-    as `core_field_total`. Diurnal variations are still in the anomaly. NaN where a sample has
-    no place, height or field.
+    as `core_field_total`. Where the track has a `diurnal`, that comes off too; without, the
+    variation of the day is still in the anomaly. NaN where a sample has no place, height or
+    field, or none of the track's diurnal.
 
-    Raises ContractError for a track without `field_total`, or with heights above an unknown
-    surface.
+    Raises ContractError for a track without `field_total`, with heights above an unknown
+    surface, or whose `diurnal` is a whole field.
     """
     if "field_total" not in track:
         raise ContractError(
@@ -181,16 +184,44 @@ def remove_from_track(
     core = Core(used, track["time"].values, params.allow_extrapolated)
     place = track["latitude"].values, track["longitude"].values
     reference = core.total(*place, np.broadcast_to(ellipsoidal_height(track), place[0].shape))
-    anomaly = track["field_total"].values.astype(np.float64) - reference
-    return track.assign(
-        core_field_total=("time", reference, {"units": "nT", "long_name": "core field"}),
-        magnetic_anomaly=(
-            "time", anomaly, {"units": "nT", "long_name": "total-field magnetic anomaly"}
-        ),
-    ).assign_attrs(
-        reference_field=used.name,
-        anomaly_definition=f"{TOTAL_FIELD_ANOMALY} at each sample's date{core.note}",
-    )  # fmt: skip
+    return total_anomaly(
+        track.assign(
+            core_field_total=("time", reference, {"units": "nT", "long_name": "core field"})
+        ).assign_attrs(
+            reference_field=used.name,
+            anomaly_definition=f"{TOTAL_FIELD_ANOMALY} at each sample's date{core.note}",
+        )
+    )
+
+
+def total_anomaly(track: xr.Dataset) -> xr.Dataset:
+    """The track with `magnetic_anomaly` (time,), nT, of what it holds.
+
+    That is field_total - core_field_total, and less `diurnal` where the track has one, which
+    `anomaly_definition` then says. Raises ContractError for a `diurnal` that is a whole field.
+    """
+    anomaly = track["field_total"].values.astype(np.float64) - track["core_field_total"].values
+    definition = str(track.attrs["anomaly_definition"])
+    if "diurnal" in track:
+        _check_variation(track["diurnal"])
+        anomaly = anomaly - track["diurnal"].values
+        definition = definition.removesuffix(_LESS_DIURNAL) + _LESS_DIURNAL
+    attributes = {"units": "nT", "long_name": "total-field magnetic anomaly"}
+    return track.assign(magnetic_anomaly=("time", anomaly, attributes)).assign_attrs(
+        anomaly_definition=definition
+    )
+
+
+def _check_variation(diurnal: xr.DataArray) -> None:
+    """Refuse a base station's whole field under the name of its variation."""
+    middle = float(np.nanmedian(diurnal.values)) if np.isfinite(diurnal.values).any() else 0.0
+    if abs(middle) >= _WEAKEST_NT:
+        raise ContractError(
+            f"its median is {middle:g} nT",
+            where=diurnal.name,
+            expected=f"a variation about a quiet level, less than {_WEAKEST_NT:g} nT",
+            remedy="if it is a base station's total field, run subtract-diurnal on its record",
+        )
 
 
 def _check_total(total: xr.DataArray) -> None:
@@ -216,7 +247,7 @@ GRID_STAGE = Stage(
 
 TRACK_STAGE = Stage(
     name="remove-core-field",
-    version=1,
+    version=2,
     params=RemoveCoreFieldParams,
     inputs={"track": "track/1", "model": OPTIONAL_FILE},
     output="track-anomaly/1",
