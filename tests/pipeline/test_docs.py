@@ -7,6 +7,7 @@ import re
 import tomllib
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -14,11 +15,24 @@ from magtiles.catalog.flags import QualityFlag
 from magtiles.catalog.releases.tile_table import TILE_VARIABLES
 from magtiles.pipeline import main as command_line
 from magtiles.pipeline.main import main
-from magtiles.pipeline.product import AnomalyTable, ProductTable, ProductTables, RegionTable
+from magtiles.pipeline.product import (
+    AnomalyTable,
+    ModelTable,
+    ProductTable,
+    ProductTables,
+    RegionTable,
+)
 from magtiles.pipeline.sample import DEMO, synthesize, write_survey
 from magtiles.schemas import contracts
 from magtiles.stages.declare import Params, parse_params
-from magtiles.stages.ingest.source import ANOMALY_GRID, IngestGridParams, SourceParams, load_source
+from magtiles.stages.ingest.field_model import FIELD_MODEL, CoefficientsParams
+from magtiles.stages.ingest.source import (
+    ANOMALY_GRID,
+    IngestGridParams,
+    SourceKind,
+    SourceParams,
+    load_source,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -27,8 +41,11 @@ TABLES = {
     "[grid]": IngestGridParams,
     "[product]": ProductTable,
     "[anomaly]": AnomalyTable,
+    "[coefficients]": CoefficientsParams,
+    "[model]": ModelTable,
     "region": RegionTable,
 }
+KINDS: dict[str, SourceKind[Any]] = {kind.name: kind for kind in (ANOMALY_GRID, FIELD_MODEL)}
 
 
 def blocks(language: str) -> list[object]:
@@ -83,9 +100,11 @@ def test_toml_examples_are_valid(page: Path, found: list[str], tmp_path: Path) -
         tables = tomllib.loads(block)
         if "source" in tables:
             (tmp_path / "source.toml").write_text(block)
-            assert load_source(tmp_path / "source.toml", ANOMALY_GRID).source.licence
+            kind = KINDS[tables["source"]["kind"]]
+            assert load_source(tmp_path / "source.toml", kind).source.licence
         else:
-            assert parse_params(ProductTables, tables, where=page).anomaly.heights_m
+            product = parse_params(ProductTables, tables, where=page)
+            assert (product.anomaly or product.model).heights_m
 
 
 def table_of(kind: type[Params]) -> str:

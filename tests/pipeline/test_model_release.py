@@ -18,7 +18,7 @@ import pytest
 from direct_sum import direct_field, split_gauss, total_anomaly
 
 from magtiles.catalog import open_release
-from magtiles.catalog.models import FieldModel, evaluate, read_model
+from magtiles.catalog.models import FieldModel, evaluate, load_igrf, read_model
 from magtiles.pipeline.build import build_product
 from magtiles.pipeline.main import main
 from magtiles.pipeline.sample_model import WorldSpec, world_model, write_world
@@ -378,3 +378,29 @@ def _write_small_emm(folder: Path) -> None:
         (folder / f"EMM{year}.COF").write_text("\n".join([f"  {year}.0  EMM-{year}", *rows]) + "\n")
     rows = cof_rows(np.zeros(15 * 17))
     (folder / "EMM2017SV.COF").write_text("\n".join(rows) + "\n")
+
+
+def test_lcs1_with_the_igrfs_core(real_data, tmp_path, caplog):
+    """A real crust, of degrees 16 to 185, in the South Atlantic; its core is another model's."""
+    shutil.copy(real_data / "harmonics/LCS-1.shc", tmp_path)
+    product = tmp_path / "lcs1.toml"
+    product.write_text(
+        '[product]\nname = "lcs1"\nversion = "1.0.0"\n[model]\ncoefficients = "LCS-1.shc"\n'
+        'core = "IGRF-14"\nepoch = 2020-01-01\nheights_m = [0, 5000, 15000]\nuncertainty_nt = 10\n'
+        "region = {latitude = [-36, -24], longitude = [10, 26]}\n"
+    )
+    with caplog.at_level(logging.WARNING):
+        path = build_product(product, store=tmp_path / "s", work=tmp_path / "w").path
+    assert "degrees 14 to 15 are neither" in caplog.text
+    assert [check for check in validate_release(path) if not check.passed] == []
+    release = open_release(path)
+    assert {i.role for i in release.manifest.inputs} == {"field model", "core field"}
+    rng = np.random.default_rng(3)
+    place = rng.uniform((-36, 10, 0), (-24, 26, 15e3), (800, 3)).T
+    lcs, igrf = read_model(real_data / "harmonics/LCS-1.shc").degrees(16, 185), load_igrf()
+    crust, core = evaluate(lcs, *place, "2020-01-01"), evaluate(igrf, *place, "2020-01-01")
+    # Of 43 nT rms; 0.031 nT in the total and 0.026 nT in the vector measured.
+    error = release.anomaly.total(*place) - total_anomaly(core, crust)
+    assert np.abs(error).max() < 0.05
+    expected = release.anomaly.expected_vector(*place, "2020-01-01")
+    assert np.abs(expected - core - crust).max() < 0.1
