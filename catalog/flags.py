@@ -61,6 +61,17 @@ class TrackFlag(enum.IntFlag):
     EXTRAPOLATED_CALIBRATION = 512
 
 
+class RoadFlag(enum.IntFlag):
+    """What is doubtful of a point of a road map (uint8)."""
+
+    INTERPOLATED = 1
+    UNDERSAMPLED = 2
+    POSITION_DOUBTFUL = 4
+    TRANSIENT_DROPPED = 8
+    SINGLE_PASS = 16
+    UNCALIBRATED = 32
+
+
 def flag_attributes(
     flags: type[enum.IntFlag] = QualityFlag, dtype: type[np.unsignedinteger[Any]] = np.uint8
 ) -> dict[str, Any]:
