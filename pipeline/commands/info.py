@@ -1,4 +1,8 @@
-"""Say what a release holds: identity, coverage, levels, accuracy, flags, files, inputs."""
+"""Say what a release or a log holds.
+
+Of a release its identity, coverage, levels, accuracy, flags, files and inputs; of a log (MCAP or
+PX4 ULog) its topics with schemas, rates, span and first values.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +16,7 @@ if TYPE_CHECKING:
     from magtiles.catalog.releases.lattice import Lattice
     from magtiles.catalog.releases.manifest import Manifest
 
-HELP = "say what a release holds"
+HELP = "say what a release or a log holds"
 NEEDS_PIPELINE = False
 
 _UNCERTAINTIES = {
@@ -24,12 +28,18 @@ _UNCERTAINTIES = {
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``magtiles info``."""
-    parser.add_argument("release", type=Path, metavar="RELEASE", help="folder of a release")
+    parser.add_argument(
+        "release", type=Path, metavar="RELEASE", help="folder of a release, or a log file"
+    )
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print what the manifest says, once every file is found to be what it lists."""
+    """Print what the manifest says, once every file is found to be what it lists; or the log."""
+    if arguments.release.is_file():
+        from magtiles.pipeline import log_info
+
+        return log_info.run(arguments.release, as_json=arguments.json)
     from magtiles.catalog import open_release
 
     release = open_release(arguments.release)

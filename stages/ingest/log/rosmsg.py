@@ -14,6 +14,9 @@ PRIMITIVES = {
 }  # fmt: skip
 """ROS types of fixed size, and how NumPy calls them without the order of bytes."""
 
+FILLER = "structure_needs_at_least_one_member"
+"""What the wire format puts into a message of no fields."""
+
 _MOST_FIELDS = 10_000
 _DEEPEST = 32
 _RULE = re.compile(r"^={20,}\s*$", re.M)
@@ -104,8 +107,8 @@ def _flatten(
 ) -> None:
     if depth > _DEEPEST or len(out) > _MOST_FIELDS:
         raise FormatError("the schema nests without end", where=where)
-    if not types[name]:  # the wire format fills a message of no fields with a byte
-        out.append(Leaf(f"{prefix}structure_needs_at_least_one_member", "uint8"))
+    if not types[name]:
+        out.append(Leaf(prefix + FILLER, "uint8"))
     for kind, field, count, is_array in types[name]:
         path = prefix + field
         if kind in PRIMITIVES or kind in ("string", "wstring"):
