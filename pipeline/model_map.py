@@ -55,7 +55,7 @@ def plan_model_map(source: ModelMap, folder: Path, data: Path | None, steps: Ste
     """
     wanted, files = source.table, _files(source, data)
     steps.report("reading coefficients")
-    chosen = {
+    chosen: dict[str, Any] = {
         "reference_epoch": wanted.epoch,
         "core_degree": wanted.core_degree,
         "crust_degree": wanted.crust_degree,

@@ -147,7 +147,7 @@ def cof_text(model: FieldModel, *, made: str = "") -> str:
     return "\n".join([*lines, *["9" * 48] * 2]) + "\n"
 
 
-def read_emm(files: Sequence[Path], where: Path) -> FieldModel:
+def read_emm(paths: Sequence[Path], where: Path) -> FieldModel:
     """The EMM in files EMM2000.COF, EMM2001.COF ... with EMM2000SV.COF ...; `where` names the set.
 
     The yearly files hold the lowest degrees, the last of them all; the higher degrees do not
@@ -155,7 +155,7 @@ def read_emm(files: Sequence[Path], where: Path) -> FieldModel:
     variation holds for five years. (NOAA's own program starts from each year with that year's
     secular variation, and so has small steps at the turn of the year.)
     """
-    found = {match[0].upper(): path for path in sorted(files)
+    found = {match[0].upper(): path for path in sorted(paths)
              if (match := _YEARLY.fullmatch(path.name))}  # fmt: skip
     years = sorted(int(name[3:7]) for name in found if "SV" not in name)
     if not years:

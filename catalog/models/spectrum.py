@@ -19,4 +19,5 @@ def power_spectrum(gauss: Floats) -> Floats:
     """
     n_max = math.isqrt(len(gauss) + 1) - 1
     n = np.arange(1, n_max + 1)
-    return (n + 1) * np.add.reduceat(np.square(gauss), n * n - 1)
+    sums: Floats = np.add.reduceat(np.square(gauss), n * n - 1)
+    return np.asarray((n + 1) * sums)

@@ -62,7 +62,9 @@ class ModelError:
         self._commission = n, power * (3.0 * uncertainty_nt**2 / power.sum())
         self._omission = _omission(n, power, missing, self._radius_km)
 
-    def sigmas(self, height_m: float, ambient_down: Real) -> dict[str, Real]:
+    def sigmas(
+        self, height_m: float, ambient_down: NDArray[np.floating]
+    ) -> dict[str, NDArray[np.floating]]:
         """1 sigma by "total", "vector" (nT) and "tensor" (nT/km); shape of `ambient_down`.
 
         Vector and tensor per component, rms over the components. The total is the part along
@@ -70,7 +72,7 @@ class ModelError:
         down component has (n + 1) / (2n + 1) of the mean square, north and east n / (4n + 2) each.
         """
         down, horizontal, tensor = self._variances(height_m)
-        steep = np.square(ambient_down, dtype=np.float64)
+        steep = np.square(ambient_down)
         vector = (down + 2.0 * horizontal) / 3.0
         return {
             "total": np.sqrt(down * steep + horizontal * (1.0 - steep)),
