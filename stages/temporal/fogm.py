@@ -17,6 +17,9 @@ Floats = NDArray[np.float64]
 SHORTEST_STEPS, LONGEST_SEGMENTS = 0.1, 1e8
 """Limits of the search for tau: below, samples are white noise; above, tau is infinite."""
 
+_BLOCK = 50_000
+"""Samples taken at once by the autocorrelation, so that their lags stay in the cache."""
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -100,24 +103,26 @@ def autocorrelation(segments: Floats) -> tuple[Floats, Floats]:
     The autocorrelation (segment, lag), zero at a lag that no two samples have, and whether
     there are such samples, 1 or 0.
     """
-    from scipy import fft
-
     n = segments.shape[1]
     valid = np.isfinite(segments)
-    size = fft.next_fast_len(2 * n - 1, real=True)
-
-    def lagged(x: Floats) -> Floats:
-        spectrum = fft.rfft(x, size, axis=1)
-        power = spectrum.real**2 + spectrum.imag**2
-        return np.asarray(fft.irfft(power, size, axis=1)[:, :n])
-
-    products = lagged(np.where(valid, segments, 0.0))
-    whole = np.arange(n, 0, -1, dtype=np.float64)
-    pairs = np.broadcast_to(whole, products.shape).copy()
     broken = ~valid.all(axis=1)
-    pairs[broken] = np.round(lagged(valid[broken].astype(np.float64)))
-    present = pairs > 0
-    return np.where(present, products / np.maximum(pairs, 1.0) * (whole / n), 0.0), present * 1.0
+    values = _lagged_products(np.where(valid, segments, 0.0)) / n
+    present = np.ones(values.shape)
+    pairs = np.round(_lagged_products(valid[broken].astype(np.float64)))
+    present[broken] = pairs > 0
+    values[broken] *= np.where(pairs > 0, np.arange(n, 0, -1) / np.maximum(pairs, 1.0), 0.0)
+    return values, present
+
+
+def _lagged_products(x: Floats) -> Floats:
+    """Sums of x_i x_(i+k) over i, for k = 0 ... n - 1, of each row (row, n)."""
+    from scipy import fft
+
+    n = x.shape[1]
+    size = fft.next_fast_len(2 * n - 1, real=True)
+    spectrum = fft.rfft(x, size, axis=1)
+    power = spectrum.real**2 + spectrum.imag**2
+    return np.asarray(fft.irfft(power, size, axis=1, overwrite_x=True)[:, :n])
 
 
 def fit_autocorrelation(segments: Floats, step_s: float) -> tuple[Floats, Floats]:
@@ -128,12 +133,17 @@ def fit_autocorrelation(segments: Floats, step_s: float) -> tuple[Floats, Floats
     tau seldom exceeds half a segment, however slow the process is: docs/fogm.md tells the bias.
     NaN where fewer than two samples are valid or all are zero.
     """
-    from magtiles.stages.temporal import fogm_compiled
+    from magtiles.stages.temporal import decay_compiled
 
-    values, weights = autocorrelation(segments)
-    found = np.full((len(values), 2), np.nan)
-    lags = np.stack([weights, values], axis=1)
-    fogm_compiled.fit_exponentials(lags, _span(segments.shape[1]), found)
+    x = np.ascontiguousarray(segments, np.float64)
+    low, high = math.log(SHORTEST_STEPS), math.log(100.0 * x.shape[1])
+    nodes = np.linspace(low, high, math.ceil(2.0 * (high - low)))
+    powers = np.exp(-np.arange(x.shape[1])[:, None] * np.exp(-nodes))
+    found = np.full((len(x), 2), np.nan)
+    rows = max(1, _BLOCK // x.shape[1])
+    for block in (slice(i, i + rows) for i in range(0, len(x), rows)):
+        values, weights = autocorrelation(x[block])
+        decay_compiled.fit_rows(nodes, powers, weights, values, found[block])
     return found[:, 0], found[:, 1] * step_s
 
 

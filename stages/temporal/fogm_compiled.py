@@ -13,7 +13,9 @@ with, over the N_k pairs that lie k steps apart, E = sum (x'-x)^2, F = sum (x'-x
 these sums hold all that the samples say, at any tau, and sums over segments add up to those of
 their joint likelihood. Written with differences they lose no digits where phi is close to one.
 
-The best s at a tau is Q / n; what is left depends on u = log tau alone.
+The best s at a tau is Q / n; what is left, the profile, depends on u = log tau alone. Its least
+is where n Q'/Q + D' = 0, and bounds of tau where it has risen by 3.84. The best tau at an s is
+where s = -Q'/D': along that ridge lie the bounds of sigma.
 """
 
 from __future__ import annotations
@@ -30,207 +32,284 @@ Floats = NDArray[np.float64]
 CHI2_95 = 3.841458820694124
 """95 % point of chi-squared with one degree of freedom: half-width of a profile in -2 log L."""
 
-GOLDEN = 0.6180339887498949
-NODES, NARROW, HALVINGS = 40, 1e-7, 40
+CLOSE, BOUND_CLOSE = 1e-8, 1e-6
+MOST_ROUNDS = 100
 
-PROFILE, S_HIGH, S_LOW, MISFIT = 0, 1, 2, 3
+PROFILE, RIDGE = 0, 1
 
 
 @compiled
-def add_segment(x: Floats, shift: float, sums: Floats) -> None:
-    """Add the sums of one segment, x (n,) less `shift`, NaN where missing, to `sums` (4, n).
+def add_segment(x: Floats, sums: Floats) -> None:
+    """Add the sums of one segment x (n,), NaN where missing, to `sums` (6, n).
 
-    Rows are N, E, F, C by steps apart; column 0 holds the first samples: their count and the
-    sum of their squares.
+    Rows are N, E, F, C, and the sums of x'-x and of x, by steps apart. In column 0 the first
+    samples: their count, sum of squares, and sum (row 4).
     """
-    before = -1
+    before, last = -2, 0.0
+    count, e, f, c, changes, lasts = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(x.size):
-        if math.isnan(x[i]):
+        value = x[i]
+        if math.isnan(value):
             continue
-        value = x[i] - shift
-        if before < 0:
-            sums[0, 0] += 1.0
-            sums[1, 0] += value * value
+        change = value - last
+        if before == i - 1:
+            count += 1.0
+            e += change * change
+            f += change * last
+            c += last * last
+            changes += change
+            lasts += last
+        elif before >= 0:
+            put(sums, i - before, (1.0, change * change, change * last, last * last, change, last))
         else:
-            last = x[before] - shift
-            gap, change = i - before, value - last
-            sums[0, gap] += 1.0
-            sums[1, gap] += change * change
-            sums[2, gap] += change * last
-            sums[3, gap] += last * last
-        before = i
+            put(sums, 0, (1.0, value * value, 0.0, 0.0, value, 0.0))
+        before, last = i, value
+    if count > 0.0:
+        put(sums, 1, (count, e, f, c, changes, lasts))
+
+
+@compiled
+def put(sums: Floats, gap: int, values: tuple[float, float, float, float, float, float]) -> None:
+    """Add to one column."""
+    for row in range(6):
+        sums[row, gap] += values[row]
 
 
 @compiled
 def compress(sums: Floats) -> Floats:
-    """The columns of `sums` that hold anything, (5, m): steps apart, N, E, F, C."""
-    used = np.flatnonzero(sums[0])
-    packed = np.empty((5, used.size))
-    packed[0] = used
-    for row in range(4):
-        for j in range(used.size):
-            packed[row + 1, j] = sums[row, used[j]]
+    """The columns of `sums` that hold anything, (7, m): steps apart, then the rows of `sums`."""
+    used = 0
+    for gap in range(sums.shape[1]):
+        used += sums[0, gap] > 0.0
+    packed, column = np.empty((7, used)), 0
+    for gap in range(sums.shape[1]):
+        if sums[0, gap] > 0.0:
+            packed[0, column] = gap
+            packed[1:, column] = sums[:, gap]
+            column += 1
     return packed
 
 
 @compiled
-def terms(u: float, packed: Floats) -> tuple[float, float, float]:
-    """Count n, D and Q of the likelihood at log tau = u."""
-    count, determinant, squares = packed[1, 0], 0.0, packed[2, 0]
+def centred(packed: Floats) -> Floats:
+    """The sums (5, m) of the same segment less its mean."""
+    total, count, m = 0.0, 0.0, 0.0
+    for j in range(packed.shape[1]):
+        total += packed[5, j] + packed[6, j]
+        count += packed[1, j]
+    m = total / count
+    about = packed[:5].copy()
+    first = packed[5, 0] - m
+    about[2, 0] = first * first
+    for j in range(1, packed.shape[1]):
+        about[3, j] -= m * packed[5, j]
+        about[4, j] += m * (m * packed[1, j] - 2.0 * packed[6, j])
+    return about
+
+
+@compiled
+def terms(u: float, packed: Floats) -> tuple[float, float, float, float, float]:
+    """n, D, Q of the likelihood at log tau = u, and the derivatives of D and Q with u."""
+    count, squares = packed[1, 0], packed[2, 0]
+    determinant, d_determinant, d_squares = 0.0, 0.0, 0.0
     rate = math.exp(-u)
     for j in range(1, packed.shape[1]):
         one_less = -math.expm1(-packed[0, j] * rate)
-        variance = one_less * (2.0 - one_less)
-        form = packed[2, j] + one_less * (2.0 * packed[3, j] + one_less * packed[4, j])
+        phi = 1.0 - one_less
+        variance = one_less * (1.0 + phi)
+        d_one_less = -packed[0, j] * rate * phi
+        d_variance = 2.0 * phi * d_one_less / variance
+        half = packed[3, j] + one_less * packed[4, j]
+        ratio = (packed[2, j] + one_less * (packed[3, j] + half)) / variance
         count += packed[1, j]
         determinant += packed[1, j] * math.log(variance)
-        squares += form / variance
-    return count, determinant, squares
+        d_determinant += packed[1, j] * d_variance
+        squares += ratio
+        d_squares += 2.0 * half * d_one_less / variance - ratio * d_variance
+    return count, determinant, squares, d_determinant, d_squares
 
 
 @compiled
-def log_excess(g: float, upper: bool) -> float:
-    """The root w of w + exp(-w) = g >= 1: above zero, or below; Newton from beyond it."""
-    half = max(g - 1.0, 0.0)
-    start = math.sqrt(2.0 * half)
-    w = start + half if upper else -start
-    for _ in range(50):
-        slope = -math.expm1(-w)
-        if slope == 0.0:
-            break
-        change = (w + math.exp(-w) - g) / slope
-        w -= change
-        if abs(change) < 1e-12 * (1.0 + abs(w)):
-            break
-    return w
+def slope(u: float, packed: Floats) -> float:
+    """Derivative of the profile with u."""
+    count, _, squares, d_determinant, d_squares = terms(u, packed)
+    return count * d_squares / squares + d_determinant
 
 
 @compiled
-def target(kind: int, u: float, packed: Floats, level: float) -> float:
-    """What is to be least over u = log tau.
+def rise(kind: int, u: float, packed: Floats, least: float) -> float:
+    """-2 log L less its least: at the best s of u (PROFILE), or where u is the best of s (RIDGE).
 
-    PROFILE: -2 log L at the best s. S_HIGH, S_LOW: minus the log of the largest and the log of
-    the smallest s where -2 log L <= level. MISFIT: of the best s phi^k to the weights and
-    autocorrelations `packed` (2, lags), less a constant.
+    Infinite where u is the best of no s.
     """
-    if kind == MISFIT:
-        across, square = project(u, packed)
-        return -(across * across) / square if across > 0.0 else 0.0
-    count, determinant, squares = terms(u, packed)
-    best = math.log(squares / count)
+    count, determinant, squares, d_determinant, d_squares = terms(u, packed)
     if kind == PROFILE:
-        return count * (best + 1.0) + determinant
-    w = log_excess((level - determinant) / count - best, kind == S_HIGH)
-    return -(best + w) if kind == S_HIGH else best + w
+        return count * (math.log(squares / count) + 1.0) + determinant - least
+    s = -d_squares / d_determinant
+    return count * math.log(s) + squares / s + determinant - least if s > 0.0 else math.inf
 
 
 @compiled
-def project(u: float, lags: Floats) -> tuple[float, float]:
-    """Weighted sums over lags of c_k phi^k and of phi^2k at log tau = u; lags (2, n): w, c."""
-    phi = math.exp(-math.exp(-u))
-    power, across, square = 1.0, 0.0, 0.0
-    for k in range(lags.shape[1]):
-        weighted = lags[0, k] * power
-        across += weighted * lags[1, k]
-        square += weighted * power
-        power *= phi
-    return across, square
+def start(packed: Floats, span: tuple[float, float]) -> float:
+    """A first u: from the regression of one sample on the last; with gaps, the best of many.
 
-
-@compiled
-def golden(kind: int, low: float, high: float, packed: Floats, level: float) -> float:
-    """Golden-section search for the least target between two u."""
-    width = high - low
-    left, right = high - GOLDEN * width, low + GOLDEN * width
-    at_left, at_right = target(kind, left, packed, level), target(kind, right, packed, level)
-    while high - low > NARROW:
-        if at_left <= at_right:
-            high, right, at_right = right, left, at_left
-            left = high - GOLDEN * (high - low)
-            at_left = target(kind, left, packed, level)
-        else:
-            low, left, at_left = left, right, at_right
-            right = low + GOLDEN * (high - low)
-            at_right = target(kind, right, packed, level)
-    return 0.5 * (low + high)
-
-
-@compiled
-def least(kind: int, low: float, high: float, packed: Floats, level: float) -> float:
-    """The u of the least target in [low, high]: the best of a row of nodes, then refined.
-
-    Exactly `low` or `high` where the target is least at that end.
+    Without gaps the profile has one minimum (its slope is a cubic in phi with one root between
+    -1 and 1); with gaps there may be several.
     """
-    spacing = (high - low) / (NODES - 1)
-    best, at_best = 0, math.inf
-    for i in range(NODES):
-        value = target(kind, low + i * spacing, packed, level)
-        if value < at_best:
-            best, at_best = i, value
-    middle = low + best * spacing
-    found = golden(kind, max(low, middle - spacing), min(high, middle + spacing), packed, level)
-    if best == 0 and target(kind, low, packed, level) <= target(kind, found, packed, level):
-        return low
-    if best == NODES - 1 and found > high - 2.0 * NARROW:
-        return high
-    return found
+    if packed.shape[1] > 2:
+        best, at_best = span[0], math.inf
+        for i in range(int(span[1] - span[0]) + 1):
+            value = rise(PROFILE, span[0] + i, packed, 0.0)
+            if value < at_best:
+                best, at_best = span[0] + i, value
+        return best
+    one_less = -packed[3, 1] / packed[4, 1] if packed[4, 1] > 0.0 else 1.0
+    guess = packed[0, 1] / max(-math.log1p(-min(one_less, 0.999)), 1e-3)
+    return min(max(math.log(guess), span[0]), span[1])
 
 
 @compiled
-def crossing(u: float, end: float, packed: Floats, level: float) -> float:
-    """Where the profile first exceeds `level`, going from u toward `end`; `end` if nowhere."""
-    inside, step = u, 0.125 if end > u else -0.125
+def least_profile(packed: Floats, span: tuple[float, float]) -> float:
+    """The u of the least profile: where its slope changes sign, next to `start`; else an end."""
+    here = start(packed, span)
+    at_here = slope(here, packed)
+    end, step = (span[1], 0.25) if at_here < 0.0 else (span[0], -0.25)
     while True:
-        outside = inside + step
-        if (end - outside) * step <= 0.0:
-            outside = end
-        if target(PROFILE, outside, packed, 0.0) > level:
-            break
-        if outside == end:
+        there = here + step
+        if (end - there) * step <= 0.0:
+            there = end
+        at_there = slope(there, packed)
+        if at_here * at_there <= 0.0:
+            return root_of_slope(packed, here, at_here, there, at_there)
+        if there == end:
             return end
-        inside, step = outside, 1.5 * step
-    for _ in range(HALVINGS):
-        middle = 0.5 * (inside + outside)
-        if target(PROFILE, middle, packed, 0.0) > level:
-            outside = middle
-        else:
-            inside = middle
-        if abs(outside - inside) < NARROW:
-            break
-    return 0.5 * (inside + outside)
+        here, at_here, step = there, at_there, 2.0 * step
 
 
 @compiled
-def fit(packed: Floats, span: tuple[float, float], bounds: bool, out: Floats) -> None:
+def root_of_slope(packed: Floats, a: float, at_a: float, b: float, at_b: float) -> float:
+    """Root of the profile's slope between a and b, by the Illinois rule."""
+    for _ in range(MOST_ROUNDS):
+        if at_b == at_a:
+            return b
+        c = b - at_b * (b - a) / (at_b - at_a)
+        at_c = slope(c, packed)
+        close = min(abs(c - b), abs(c - a)) < CLOSE
+        if at_c * at_b <= 0.0:
+            a, at_a = b, at_b
+        else:
+            at_a *= 0.5
+        b, at_b = c, at_c
+        if close or at_c == 0.0:
+            break
+    return b
+
+
+@compiled
+def crossing(kind: int, packed: Floats, least: float, inside: float, outside: float) -> float:
+    """Where the square root of `rise` passes that of 3.84, between u inside and outside.
+
+    The root is close to a straight line in u. Illinois rule, halving where it is infinite.
+    """
+    aim = math.sqrt(CHI2_95)
+    a, b = inside, outside
+    at_a = math.sqrt(max(rise(kind, a, packed, least), 0.0)) - aim
+    at_b = math.sqrt(max(rise(kind, b, packed, least), 0.0)) - aim
+    if at_b <= 0.0:
+        return outside
+    if at_a >= 0.0:
+        return inside
+    side = 0
+    for _ in range(MOST_ROUNDS):
+        wide = math.isinf(at_b)
+        c = 0.5 * (a + b) if wide else b - at_b * (b - a) / (at_b - at_a)
+        at_c = math.sqrt(max(rise(kind, c, packed, least), 0.0)) - aim
+        change = min(abs(c - a), abs(c - b))
+        if at_c > 0.0:
+            b, at_b = c, at_c
+            at_a = 0.5 * at_a if side == 1 else at_a
+            side = 1
+        else:
+            a, at_a = c, at_c
+            at_b = 0.5 * at_b if side == -1 else at_b
+            side = -1
+        if change < BOUND_CLOSE:
+            break
+    return c
+
+
+@compiled
+def beyond(u: float, packed: Floats, least: float, end: float) -> float:
+    """A u from which the profile exceeds its bound, away from its least at u; or `end`."""
+    step = 0.5 if end > u else -0.5
+    while True:
+        u += step
+        if (end - u) * step <= 0.0:
+            return end
+        if rise(PROFILE, u, packed, least) > CHI2_95:
+            return u
+        step *= 2.0
+
+
+@compiled
+def edge_s(u: float, packed: Floats, level: float, upper: bool) -> float:
+    """The largest or smallest s with -2 log L <= level at u: log r + 1 / r = g, s = r Q / n."""
+    count, determinant, squares, _, _ = terms(u, packed)
+    g = (level - determinant) / count - math.log(squares / count)
+    half = max(g - 1.0, 0.0)
+    first = math.sqrt(2.0 * half)
+    w = first + half if upper else -first
+    for _ in range(MOST_ROUNDS):
+        steepness = -math.expm1(-w)
+        if steepness == 0.0:
+            break
+        change = (w + math.exp(-w) - g) / steepness
+        w -= change
+        if abs(change) < CLOSE:
+            break
+    return squares / count * math.exp(w)
+
+
+@compiled
+def bounds(u: float, packed: Floats, span: tuple[float, float], out: Floats) -> None:
+    """Fill out[1], out[2] and out[4], out[5] with the 95 % bounds of sigma and of tau.
+
+    Where the profile of tau ends, s cannot be farther along the ridge.
+    """
+    least = rise(PROFILE, u, packed, 0.0)
+    for side in range(2):
+        end = span[side]
+        at_tau = u
+        if u != end:
+            at_tau = crossing(PROFILE, packed, least, u, beyond(u, packed, least, end))
+        at_sigma = crossing(RIDGE, packed, least, u, at_tau) if at_tau != u else u
+        out[1 + side] = math.sqrt(edge_s(at_sigma, packed, least + CHI2_95, side == 1))
+        out[4 + side] = end_of(side) if at_tau == end else math.exp(at_tau)
+
+
+@compiled
+def end_of(side: int) -> float:
+    """The tau that an end of the search stands for."""
+    return 0.0 if side == 0 else math.inf
+
+
+@compiled
+def fit(packed: Floats, span: tuple[float, float], bounded: bool, out: Floats) -> None:
     """Fill out (6,): sigma, its 95 % bounds, tau, its bounds; NaN where the samples fix none.
 
-    `span` limits log tau: at its ends tau is 0 or infinite. Where all samples are equal the
-    likelihood has no maximum. Without `bounds` only sigma and tau are filled.
+    `span` limits log tau; at its lower end tau is 0. Where all samples are equal the likelihood
+    has no maximum. Unless `bounded` only sigma and tau are filled.
     """
     out[:] = math.nan
-    low, high = span
     if packed.shape[1] < 2 or packed[2, 1:].sum() <= 0.0:
         return
-    u = least(PROFILE, low, high, packed, 0.0)
-    count, _, squares = terms(u, packed)
-    out[0], out[3] = math.sqrt(squares / count), tau_at(u, span)
-    if not bounds:
+    u = least_profile(packed, span)
+    if u >= span[1]:
         return
-    level = target(PROFILE, u, packed, 0.0) + CHI2_95
-    left, right = crossing(u, low, packed, level), crossing(u, high, packed, level)
-    out[4], out[5] = tau_at(left, span), tau_at(right, span)
-    smallest = golden(S_LOW, left, right, packed, level)
-    largest = golden(S_HIGH, left, right, packed, level)
-    out[1] = math.exp(0.5 * target(S_LOW, smallest, packed, level))
-    out[2] = math.exp(-0.5 * target(S_HIGH, largest, packed, level))
-
-
-@compiled
-def tau_at(u: float, span: tuple[float, float]) -> float:
-    """The tau of a u, steps; at the ends of the search zero and infinity."""
-    if u <= span[0]:
-        return 0.0
-    return math.inf if u >= span[1] else math.exp(u)
+    count, _, squares, _, _ = terms(u, packed)
+    out[0], out[3] = math.sqrt(squares / count), 0.0 if u <= span[0] else math.exp(u)
+    if bounded:
+        bounds(u, packed, span, out)
 
 
 @compiled
@@ -239,15 +318,16 @@ def fit_each(x: Floats, span: tuple[float, float], out: Floats) -> None:
 
     Columns: the six of `fit` about zero, then sigma and tau about the mean.
     """
-    sums, about_mean = np.empty((4, x.shape[1])), np.empty(6)
+    sums, about_mean = np.empty((6, x.shape[1])), np.empty(6)
     for i in range(x.shape[0]):
+        out[i] = math.nan
         sums[:] = 0.0
-        add_segment(x[i], 0.0, sums)
-        fit(compress(sums), span, True, out[i, :6])
-        sums[:] = 0.0
-        add_segment(x[i], np.nanmean(x[i]), sums)
-        fit(compress(sums), span, False, about_mean)
-        out[i, 6], out[i, 7] = about_mean[0], about_mean[3]
+        add_segment(x[i], sums)
+        packed = compress(sums)
+        if packed.shape[1] > 1:
+            fit(packed, span, True, out[i, :6])
+            fit(centred(packed), span, False, about_mean)
+            out[i, 6], out[i, 7] = about_mean[0], about_mean[3]
 
 
 @compiled
@@ -258,26 +338,15 @@ def fit_classes(
 
     Fills out (classes, 6) as `fit` does.
     """
-    sums = np.empty((4, x.shape[1]))
-    for c in range(members.shape[0]):
+    classes, n = members.shape[0], x.shape[1]
+    of_class, sums = np.zeros((classes, 6, n)), np.empty((6, n))
+    for i in range(x.shape[0]):
         sums[:] = 0.0
-        for i in range(x.shape[0]):
+        add_segment(x[i], sums)
+        packed = compress(sums)
+        for c in range(classes):
             if members[c, i]:
-                add_segment(x[i], 0.0, sums)
-        fit(compress(sums), span, True, out[c])
-
-
-@compiled
-def fit_exponentials(lags: Floats, span: tuple[float, float], out: Floats) -> None:
-    """Fit s exp(-k / tau) to each of lags (segments, 2, n), weights and autocorrelations.
-
-    Least squares, with s at its best for each tau; fills out (segments, 2): sigma, tau. NaN
-    where all is zero or no two samples are there.
-    """
-    for i in range(lags.shape[0]):
-        out[i] = math.nan
-        if not (lags[i, 1, 0] > 0.0 and lags[i, 0].sum() > 1.0):
-            continue
-        u = least(MISFIT, span[0], span[1], lags[i], 0.0)
-        across, square = project(u, lags[i])
-        out[i, 0], out[i, 1] = math.sqrt(across / square), tau_at(u, span)
+                for j in range(packed.shape[1]):
+                    of_class[c, :, int(packed[0, j])] += packed[1:, j]
+    for c in range(classes):
+        fit(compress(of_class[c]), span, True, out[c])
