@@ -18,7 +18,7 @@ from magtiles.stages.ingest import grid, index
 from magtiles.stages.ingest.log import stage as log
 from magtiles.stages.ingest.observatory import stage as observatory
 from magtiles.stages.release import expect_total, tiles
-from magtiles.stages.temporal import assemble, baseline, check, diurnal
+from magtiles.stages.temporal import assemble, baseline, check, diurnal, fit_fogm
 from magtiles.stages.vehicle.calibration import apply as apply_calibration
 from magtiles.stages.vehicle.calibration import calibrate
 from magtiles.stages.vehicle.tolles_lawson import apply as apply_tolles_lawson
@@ -40,6 +40,7 @@ STAGES: tuple[Stage, ...] = (
     rereference.STAGE,
     check.STAGE,
     baseline.STAGE,
+    fit_fogm.STAGE,
     assemble.STAGE,
     diurnal.RECORD_STAGE,
     diurnal.BASELINE_STAGE,
