@@ -39,7 +39,8 @@ $(RELEASES): release/%: % $(READY)
 	@built=$$($(MAGTILES) build $* --store $(STORE) --json) && \
 	  $(MAGTILES) validate "$$(printf '%s' "$$built" | $(PATH_OF))"
 
-build/sample/demo.toml build/sample/world.toml: pipeline/sample.py pipeline/sample_model.py $(READY)
+build/sample/demo.toml build/sample/world.toml: pipeline/sample.py pipeline/sample_model.py \
+  pipeline/synthetic_observatories.py $(READY)
 	$(MAGTILES) sample $(@D)
 
 test: $(READY) ## Run the tests

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from magtiles.catalog.releases.temporal_table import PATH as TEMPORAL_PATH
 from magtiles.pipeline import receipts
 from magtiles.pipeline.cutting import cutting
 from magtiles.pipeline.model_map import plan_model_map
@@ -15,7 +16,8 @@ from magtiles.pipeline.product import ModelMap, Product, load_product
 from magtiles.pipeline.progress import Progress, silent
 from magtiles.pipeline.steps import MapPlan, Steps
 from magtiles.pipeline.survey_map import plan_survey_map
-from magtiles.schemas.errors import CoverageError, MagtilesError, ParameterError
+from magtiles.pipeline.temporal_part import TemporalResult, build_temporal
+from magtiles.schemas.errors import CoverageError, MagtilesError, ParameterError, SourceError
 from magtiles.stages.release.publish import PublishResult, publish_release
 from magtiles.stages.release.records import MeasuredTile
 
@@ -75,8 +77,13 @@ def _build(
     wanted: Product, store: Path, work: Path, data: Path | None, progress: Progress
 ) -> PublishResult:
     folder = work / wanted.product.name
-    steps = Steps(progress, total=4 + len(wanted.map.table.heights_m))
+    more = 0 if wanted.temporal is None else wanted.temporal.steps
+    steps = Steps(progress, total=4 + len(wanted.map.table.heights_m) + more)
     plan = _plan(wanted, folder, data, steps)
+    temporal = None
+    if wanted.temporal is not None:
+        _require_core_field(plan)
+        temporal = build_temporal(wanted.temporal, folder, data, steps)
     with cutting(plan.lattice, len(plan.heights)) as cutter:
         levels, pictures = [], []
         for height in plan.heights:
@@ -86,13 +93,24 @@ def _build(
         cut = cutter.cut(levels, folder / "tiles", progress)
         cutter.finish_drawing()
     steps.report("publishing")
-    return _publish(wanted, store, plan, cut, levels, pictures)
+    return _publish(wanted, store, plan, cut, levels, pictures, temporal)
 
 
 def _plan(wanted: Product, folder: Path, data: Path | None, steps: Steps) -> MapPlan:
     if isinstance(wanted.map, ModelMap):
         return plan_model_map(wanted.map, folder, data, steps)
     return plan_survey_map(wanted.map, folder, data, steps)
+
+
+def _require_core_field(plan: MapPlan) -> None:
+    """Raise SourceError, before the work, where a reader could not use a temporal part."""
+    if plan.core_field is None:
+        raise SourceError(
+            "there is a [temporal] table, but no core field at hand to tell dip latitude by",
+            where=plan.source,
+            expected="a reference field whose coefficients are at hand, such as IGRF-14",
+            remedy="leave [temporal] out, or re-reference the survey",
+        )
 
 
 def _publish(
@@ -102,26 +120,33 @@ def _publish(
     cut: Sequence[MeasuredTile],
     levels: Sequence[Path],
     pictures: Sequence[Path],
+    temporal: TemporalResult | None,
 ) -> PublishResult:
     extra = {f"preview/{picture.name}": picture for picture in pictures}
     if plan.core_field is not None:
         extra["core_field.shc"] = plan.core_field
+    inputs, artifacts = list(plan.inputs), [*plan.artifacts, *levels]
+    if temporal is not None:
+        extra |= {f"preview/{name}": picture for name, picture in temporal.pictures.items()}
+        extra[TEMPORAL_PATH] = temporal.path
+        inputs += temporal.inputs
+        artifacts += temporal.artifacts
     return publish_release(
         store,
         product=wanted.product.name,
         version=wanted.product.version,
         tiles=cut,
         identity={},
-        inputs=plan.inputs,
-        provenance=_provenance(wanted, plan, levels),
+        inputs=inputs,
+        provenance=_provenance(wanted, plan, artifacts),
         extra_files=extra,
     )
 
 
-def _provenance(wanted: Product, plan: MapPlan, levels: Sequence[Path]) -> dict[str, Any]:
+def _provenance(wanted: Product, plan: MapPlan, artifacts: Sequence[Path]) -> dict[str, Any]:
     """How the release was made: every artifact with its stage, parameters and inputs."""
     steps = []
-    for artifact in [*plan.artifacts, *levels]:
+    for artifact in artifacts:
         if (receipt := receipts.read_receipt(artifact)) is not None:
             kept = {k: receipt[k] for k in ("stage", "version", "params", "inputs")}
             steps.append({"artifact": artifact.name, **kept})

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Annotated, Literal
 
 import pydantic
 
 from magtiles.catalog.models.igrf import igrf_files
+from magtiles.pipeline.source_paths import find_source
+from magtiles.pipeline.temporal_part import TemporalSources, TemporalTable, load_temporal
 from magtiles.schemas.errors import SourceError
 from magtiles.stages.declare import IsoDate, Params, parse_params, quantity
 from magtiles.stages.ingest.field_model import FIELD_MODEL, igrf_coefficients, model_files
@@ -147,11 +148,12 @@ class ModelTable(Params):
 
 
 class ProductTables(Params):
-    """The whole of a product TOML: one of [anomaly] and [model]."""
+    """The whole of a product TOML: one of [anomaly] and [model], and what goes with it."""
 
     product: ProductTable = quantity("1", doc="Name and version.")
     anomaly: AnomalyTable | None = quantity("1", default=None, doc="The map of a survey.")
     model: ModelTable | None = quantity("1", default=None, doc="The map of a field model.")
+    temporal: TemporalTable | None = quantity("1", default=None, doc="Variations in time.")
 
 
 @dataclass(frozen=True)
@@ -192,6 +194,7 @@ class Product:
     path: Path
     product: ProductTable
     map: SurveyMap | ModelMap
+    temporal: TemporalSources | None = None
 
 
 def load_product(path: Path) -> Product:
@@ -210,13 +213,18 @@ def load_product(path: Path) -> Product:
             expected="one: a survey's map, or a field model's",
             remedy="make two products of it" if tables.anomaly else "add one",
         )
+    temporal = None if tables.temporal is None else load_temporal(tables.temporal, path)
+    return Product(path, tables.product, _map(tables, path), temporal)
+
+
+def _map(tables: ProductTables, path: Path) -> SurveyMap | ModelMap:
     if tables.model is not None:
-        return Product(path, tables.product, _model_map(tables.model, path))
+        return _model_map(tables.model, path)
     assert tables.anomaly is not None
-    source_path = _find_source(tables.anomaly.source, path, "anomaly.source")
+    source_path = find_source(tables.anomaly.source, path, "anomaly.source")
     source = load_source(source_path, ANOMALY_GRID)
     _check_reference(tables.anomaly, source, path)
-    return Product(path, tables.product, SurveyMap(tables.anomaly, source_path, source))
+    return SurveyMap(tables.anomaly, source_path, source)
 
 
 def _model_map(model: ModelTable, product: Path) -> ModelMap:
@@ -225,7 +233,7 @@ def _model_map(model: ModelTable, product: Path) -> ModelMap:
     if direct.exists() and direct.suffix != ".toml":
         files = tuple(model_files(direct))
         return ModelMap(model, direct, direct.stem, "not stated", None, files, core)
-    path = _find_source(model.coefficients, product, "model.coefficients")
+    path = find_source(model.coefficients, product, "model.coefficients")
     source = load_source(path, FIELD_MODEL)
     header = source.source
     return ModelMap(model, path, header.id, header.licence, header.url, source.files, core)
@@ -243,28 +251,6 @@ def _find_core(name: str, product: Path) -> Path:
             expected=f"one of {known}, or the path of a coefficient file",
         )
     return file
-
-
-def _find_source(name: str, product: Path, key: str) -> Path:
-    if name.endswith(".toml"):
-        found = product.parent / name
-        if found.is_file():
-            return found
-        raise SourceError(
-            f"source '{name}' does not exist",
-            where=f"{product} {key}",
-            expected=f"a file at {found}",
-            remedy="correct the path",
-        )
-    entry = Path(str(resources.files("magtiles.catalog"))) / "sources" / f"{name}.toml"
-    if entry.is_file():
-        return entry
-    raise SourceError(
-        f"the catalog has no source '{name}'",
-        where=f"{product} {key}",
-        expected="the path of a source TOML, or an id in the catalog",
-        remedy="write the path with its .toml",
-    )
 
 
 def _check_reference(anomaly: AnomalyTable, source: Source[IngestGridParams], path: Path) -> None:

@@ -13,7 +13,13 @@ import xarray as xr
 
 from magtiles.catalog.kernels.dipole import TENSOR
 from magtiles.pipeline.sample_aircraft import write_flight
+from magtiles.pipeline.sample_observatories import (
+    temporal_table,
+    write_observatories,
+    write_truth,
+)
 from magtiles.pipeline.synthetic import DEMO, ConstantField, Sample, SampleSpec, synthesize
+from magtiles.pipeline.synthetic_observatories import TemporalSample
 from magtiles.stages.release.atomic import atomic_path
 
 __all__ = [
@@ -30,14 +36,17 @@ __all__ = [
 _NO_DATA = -999999.0
 
 
-def write_sample(folder: Path, spec: SampleSpec = DEMO) -> list[Path]:
+def write_sample(
+    folder: Path, spec: SampleSpec = DEMO, temporal: TemporalSample | None = None
+) -> list[Path]:
     """Write survey, source TOML, product TOML and truth of a spec; the same bytes every time.
 
     Returns the paths ``<name>-survey.tif``, ``<name>-survey.toml``, ``<name>.toml`` and
-    ``<name>-truth.nc``, then those of `write_flight`. Existing files are replaced whole.
+    ``<name>-truth.nc``, then those of `write_flight`; with a `temporal` sample those of
+    `write_observatories` and ``<name>-temporal-truth.nc``. Existing files are replaced whole.
     """
     sample = synthesize(spec)
-    paths = write_survey(folder, sample)
+    paths = write_survey(folder, sample, temporal)
     truth = folder / f"{spec.name}-truth.nc"
     dataset = truth_dataset(sample)
     packing = {"zlib": True, "complevel": 1, "shuffle": True}
@@ -47,22 +56,37 @@ def write_sample(folder: Path, spec: SampleSpec = DEMO) -> list[Path]:
     }
     with atomic_path(truth) as temporary:
         dataset.to_netcdf(temporary, engine="netcdf4", format="NETCDF4", encoding=encoding)
-    return [*paths, truth, *write_flight(folder, sample)]
+    paths = [*paths[:3], truth, *write_flight(folder, sample), *paths[3:]]
+    if temporal is not None:
+        paths.append(folder / f"{spec.name}-temporal-truth.nc")
+        write_truth(paths[-1], temporal)
+    return paths
 
 
-def write_survey(folder: Path, sample: Sample) -> list[Path]:
-    """Write a sample without its truth: survey GeoTIFF, source TOML, product TOML."""
+def write_survey(
+    folder: Path, sample: Sample, temporal: TemporalSample | None = None
+) -> list[Path]:
+    """Write a sample without its truth: survey GeoTIFF, source TOML, product TOML.
+
+    With a `temporal` sample also the files of `write_observatories`, which the product names.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     spec = sample.spec
+    product = _product_toml(spec)
+    if temporal is not None:
+        product += "\n".join(temporal_table(spec.name, temporal)) + "\n"
     contents = {
         f"{spec.name}-survey.tif": _geotiff(sample),
         f"{spec.name}-survey.toml": _source_toml(spec).encode(),
-        f"{spec.name}.toml": _product_toml(spec).encode(),
+        f"{spec.name}.toml": product.encode(),
     }
     for name, content in contents.items():
         with atomic_path(folder / name) as temporary:
             temporary.write_bytes(content)
-    return [folder / name for name in contents]
+    paths = [folder / name for name in contents]
+    if temporal is not None:
+        paths += write_observatories(folder, spec.name, temporal)
+    return paths
 
 
 def truth_dataset(sample: Sample) -> xr.Dataset:

@@ -174,7 +174,7 @@ class TemporalModel:
         direction, dip = self._direction(lat, lon, when)
         moved, outside = _into_span(self.months, when)
         curves, errors = self._curves(lon, moved)
-        weights = self._weights(lat, lon, dip, np.isfinite(curves[:3]).all(axis=0))
+        weights = self._weights(lat, lon, dip, np.asarray(np.isfinite(curves[:3]).all(axis=0)))
         curves[3] = np.einsum("na,aon->on", direction, curves[:3])
         values = _weighted(weights, curves)
         spread = _weighted(weights, (curves - values.T[:, None, :]) ** 2)

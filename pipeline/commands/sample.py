@@ -1,11 +1,11 @@
-"""Write the synthetic samples: a survey with its exact truth, and a field model, with TOML files."""
+"""Write the synthetic samples: a survey, observatories and a field model, with exact truth."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-HELP = "write the synthetic survey, its truth, and a synthetic field model"
+HELP = "write the synthetic survey, flight, observatories and field model, with their truth"
 NEEDS_PIPELINE = True
 
 
@@ -18,7 +18,9 @@ def run(arguments: argparse.Namespace) -> int:
     """Write the samples and list their files."""
     from magtiles.pipeline.sample import write_sample
     from magtiles.pipeline.sample_model import write_world
+    from magtiles.pipeline.synthetic_observatories import TemporalSample
 
-    for path in [*write_sample(arguments.folder), *write_world(arguments.folder)]:
+    survey = write_sample(arguments.folder, temporal=TemporalSample())
+    for path in [*survey, *write_world(arguments.folder)]:
         print(path)
     return 0
