@@ -17,10 +17,10 @@ from magtiles.pipeline.product import AnomalyTable, SurveyMap
 from magtiles.pipeline.steps import MapPlan, Steps, node_axes
 from magtiles.schemas.errors import CoverageError
 from magtiles.stages.field import components, crop, voids
-from magtiles.stages.field.direction import reference_coefficients
 from magtiles.stages.field.extent import data_bounds
 from magtiles.stages.field.geometry import true_spacing
 from magtiles.stages.ingest import grid as ingest
+from magtiles.stages.ingest.field_model import igrf_coefficients
 from magtiles.stages.release.plan import Bounds, plan_lattice
 
 _MARGIN_HEIGHTS = 20.0
@@ -58,7 +58,7 @@ def plan_survey_map(source: SurveyMap, folder: Path, data: Path | None, steps: S
         artifacts=[folder / name for name in names],
         inputs=_inputs(source, files),
         source=source.path,
-        core_field=reference_coefficients(survey.reference_field),
+        core_field=igrf_coefficients(survey.reference_field),
     )
 
 

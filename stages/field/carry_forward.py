@@ -18,7 +18,6 @@ from magtiles.catalog.flags import QualityFlag, flag_attributes
 from magtiles.schemas.errors import ContractError
 from magtiles.stages.declare import OPTIONAL_FILE, IsoDate, Params, Stage, quantity
 from magtiles.stages.field.core_field import NO_REFERENCE, Core, with_anomaly
-from magtiles.stages.field.direction import reference_coefficients
 from magtiles.stages.field.geometry import axes, is_geographic
 from magtiles.stages.field.padding import Padding, plan_padding
 from magtiles.stages.field.plane import STEP_DEG, STEP_M, Plane, on_lattice
@@ -32,7 +31,7 @@ from magtiles.stages.field.spectral import (
     forward,
     inverse,
 )
-from magtiles.stages.ingest.field_model import igrf, named_model
+from magtiles.stages.ingest.field_model import igrf, igrf_coefficients, named_model
 
 Real = NDArray[np.float64]
 
@@ -131,7 +130,7 @@ def _fields(
         (name, str(grid.attrs["reference_epoch"]), old_model, "old_model"),
         (params.reference_field or name, params.reference_epoch, new_model, "new_model"),
     ):
-        at_hand = file is not None or reference_coefficients(field) is not None
+        at_hand = file is not None or igrf_coefficients(field) is not None
         stands_in = not at_hand and field != params.reference_field
         model = igrf() if stands_in else named_model(field, file, role=role)
         cores.append(Core(model, epoch, params.allow_extrapolated))

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import datetime
 import logging
-import re
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import ppigrf
 import xarray as xr
 from numpy.typing import NDArray
 
+from magtiles.catalog.models import FieldModel, evaluate, load_igrf, read_model
 from magtiles.schemas.errors import CoverageError, ParameterError
+from magtiles.stages.ingest.field_model import igrf_coefficients
 
 Real = NDArray[np.float64]
-
-_METRES_PER_KM = 1000.0
 
 _log = logging.getLogger(__name__)
 
@@ -47,47 +43,6 @@ def from_angles(inclination_deg: float, declination_deg: float, shape: tuple[int
     return Ambient(*(np.full(shape, part) for part in parts))
 
 
-def reference_coefficients(reference_field: str) -> Path | None:
-    """The coefficient file of an IGRF generation that ppigrf carries; None for any other field."""
-    generation = reference_field.upper().replace("-", "").replace(" ", "")
-    if re.fullmatch(r"IGRF\d+", generation) is None:
-        return None
-    file = Path(ppigrf.__file__).with_name(f"{generation}.shc")
-    return file if file.is_file() else None
-
-
-def igrf_direction(
-    latitude: Real,
-    longitude: Real,
-    height_m: float,
-    date: datetime.datetime,
-    coefficients: Path | None = None,
-) -> Ambient:
-    """Direction of the IGRF at WGS84 positions (degrees) and ellipsoidal height, any shape.
-
-    `coefficients` names an .shc file; default the newest generation.
-    """
-    file = {} if coefficients is None else {"coeff_fn": str(coefficients)}
-    east, north, up = (
-        np.asarray(part)[0]
-        for part in ppigrf.igrf(longitude, latitude, height_m / _METRES_PER_KM, date, **file)
-    )
-    strength = np.sqrt(east**2 + north**2 + up**2)
-    return Ambient(north / strength, east / strength, -up / strength)
-
-
-def _check_epoch(date: datetime.datetime, coefficients: Path | None) -> None:
-    """Raise CoverageError for a date that the coefficients do not cover."""
-    file = () if coefficients is None else (str(coefficients),)
-    epochs = ppigrf.ppigrf.read_shc(*file)[0].index
-    if not epochs[0] <= date <= epochs[-1]:
-        raise CoverageError(
-            f"reference_epoch {date:%Y-%m-%d} is outside the span of the IGRF",
-            expected=f"{epochs[0]:%Y-%m-%d} to {epochs[-1]:%Y-%m-%d}",
-            remedy="correct it, or give inclination_deg and declination_deg",
-        )
-
-
 class AmbientSource:
     """Where the ambient direction of a map comes from: given angles, or the IGRF at its epoch.
 
@@ -107,21 +62,34 @@ class AmbientSource:
                 remedy="give both, or neither to use the reference field at its epoch",
             )
         self._angles = inclination_deg, declination_deg
-        self._date = datetime.datetime.fromisoformat(grid.attrs["reference_epoch"])
-        self._coefficients = reference_coefficients(str(grid.attrs["reference_field"]))
-        if inclination_deg is None:
-            _check_epoch(self._date, self._coefficients)
-            if self._coefficients is None:
-                _log.warning(
-                    "no coefficients of reference field '%s' at hand: the ambient direction is "
-                    "the newest IGRF's",
-                    grid.attrs["reference_field"],
-                )
+        self._date = str(grid.attrs["reference_epoch"])
         self._height = float(np.mean(grid["height"].values))
+        if inclination_deg is None:
+            self._igrf = _igrf(str(grid.attrs["reference_field"]), self._date)
 
     def at(self, latitude: Real, longitude: Real) -> Ambient:
         """The direction at WGS84 positions (degrees), of their shape."""
         inclination, declination = self._angles
         if inclination is not None and declination is not None:
             return from_angles(inclination, declination, np.shape(latitude))
-        return igrf_direction(latitude, longitude, self._height, self._date, self._coefficients)
+        field = evaluate(self._igrf, latitude, longitude, self._height, self._date)
+        return Ambient(*np.moveaxis(field / np.linalg.norm(field, axis=-1, keepdims=True), -1, 0))
+
+
+def _igrf(reference_field: str, date: str) -> FieldModel:
+    """The generation of that name, else the newest; CoverageError for a date it does not cover."""
+    file = igrf_coefficients(reference_field)
+    if file is None:
+        _log.warning(
+            "no coefficients of reference field '%s' at hand: the ambient direction is the newest "
+            "IGRF's",
+            reference_field,
+        )
+    model = load_igrf() if file is None else read_model(file)
+    if not model.covers(date):
+        raise CoverageError(
+            f"reference_epoch {date} is outside the span of the IGRF",
+            expected=f"{model.valid[0]:g} to {model.valid[1]:g}",
+            remedy="correct it, or give inclination_deg and declination_deg",
+        )
+    return model
