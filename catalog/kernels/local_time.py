@@ -45,7 +45,8 @@ def mid_month(months: Times) -> Times:
     """The instants halfway through months, datetime64[ns], given their starts."""
     start = months.astype("datetime64[M]")
     first = start.astype("datetime64[ns]")
-    return first + ((start + 1).astype("datetime64[ns]") - first) // 2
+    middle: Times = first + ((start + 1).astype("datetime64[ns]") - first) // 2
+    return middle
 
 
 def baseline_at(months: Times, baseline: Floats, time: Times, longitude_deg: ArrayLike) -> Floats:

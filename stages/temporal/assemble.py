@@ -44,8 +44,10 @@ def assemble_temporal(
     merged = functools.reduce(_merge, keyed)
     merged = merged.sortby([d for d in ("observatory", "month", "segment") if d in merged.dims])
     result = _unkeyed(merged, models)
-    place = (result[k].values for k in ("latitude", "longitude", "elevation"))
-    result["dip_latitude"].values = dip_latitude(*place, _middle(result))
+    latitude, longitude, elevation = (
+        result[name].values for name in ("latitude", "longitude", "elevation")
+    )
+    result["dip_latitude"].values = dip_latitude(latitude, longitude, elevation, _middle(result))
     return result.assign_attrs(_attributes(models))
 
 
@@ -109,13 +111,12 @@ def _unkeyed(merged: xr.Dataset, models: Sequence[xr.Dataset]) -> xr.Dataset:
             result[name] = (dimension, result[dimension].values)
     result = result.drop_vars([d for d in (*_KEYS, "rank", "class") if d in result.coords])
     for model in models:
-        for name in model.data_vars:
-            stated, array = model[name], result.get(name)
-            if array is not None and stated.dtype.kind in "iu":
-                whole = array.fillna(_UNKNOWN.get(str(name), 0)).astype(stated.dtype)
-                result[name] = whole
-            if name in result:
-                result[name].attrs = dict(stated.attrs)
+        for variable in (v for v in map(str, model.data_vars) if v in result):
+            stated = model[variable]
+            if stated.dtype.kind in "iu":
+                whole = result[variable].fillna(_UNKNOWN.get(variable, 0))
+                result[variable] = whole.astype(stated.dtype)
+            result[variable].attrs = dict(stated.attrs)
     count = result.sizes["observatory"]
     result["dip_latitude"] = ("observatory", np.zeros(count), {"units": "degrees_north"})
     return result

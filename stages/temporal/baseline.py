@@ -169,7 +169,7 @@ def _distance(minute: Real, phase: Real) -> Real:
     """Minutes from each minute of the day to the nearest phase, over midnight too."""
     around = np.concatenate([phase[-1:] - MINUTES_PER_DAY, phase, phase[:1] + MINUTES_PER_DAY])
     after = np.searchsorted(around, minute).clip(1)
-    return np.minimum(minute - around[after - 1], around[after] - minute)
+    return np.asarray(np.minimum(minute - around[after - 1], around[after] - minute), np.float64)
 
 
 def _report(
@@ -228,15 +228,18 @@ def _model(series: xr.Dataset, months: NDArray[np.datetime64], made: list[Month]
 
 def observatory(series: xr.Dataset, date: np.datetime64) -> xr.Dataset:
     """The part of a temporal-model/1 that says which observatory it is of."""
-    place = [np.array([float(series.attrs[k])]) for k in ("latitude", "longitude", "elevation")]
+    latitude, longitude, elevation = (
+        np.array([float(series.attrs[name])]) for name in ("latitude", "longitude", "elevation")
+    )
+    dip = dip_latitude(latitude, longitude, elevation, date)
     degrees = {"units": "degrees_north"}
     return xr.Dataset(
         {
             "iaga_code": ("observatory", np.array([series.attrs["iaga_code"]])),
-            "latitude": ("observatory", place[0], degrees),
-            "longitude": ("observatory", place[1], {"units": "degrees_east"}),
-            "elevation": ("observatory", place[2], {"units": "m"}),
-            "dip_latitude": ("observatory", dip_latitude(*place, date), degrees),
+            "latitude": ("observatory", latitude, degrees),
+            "longitude": ("observatory", longitude, {"units": "degrees_east"}),
+            "elevation": ("observatory", elevation, {"units": "m"}),
+            "dip_latitude": ("observatory", dip, degrees),
             "element": ("element", np.array(ELEMENTS)),
         },
         attrs={"source": str(series.attrs["source"]), "cadence_s": series.attrs["cadence_s"]},

@@ -103,7 +103,7 @@ def _midnights(laid: Real, phases: int, minute: Real) -> Real:
 
 def _local_ns(series: xr.Dataset) -> NDArray[np.int64]:
     """Nanoseconds of local mean solar time since 1970, local date included."""
-    longitude = float(wrap_longitude(np.float64(series.attrs["longitude"])))
+    longitude = float(wrap_longitude(np.asarray(series.attrs["longitude"], np.float64)))
     time = series["time"].values.astype("datetime64[ns]").astype(np.int64)
     shifted: NDArray[np.int64] = time + round(longitude * _NS_PER_DEGREE)
     return shifted
@@ -118,7 +118,7 @@ def _step_ns(series: xr.Dataset) -> int:
         f"one value every {cadence:g} s",
         where=f"{series.attrs.get('source', '')} cadence_s".strip(),
         expected="from a minute to an hour, a whole number of times a day",
-        remedy="reduce seconds to minutes with ingest-observatory"
+        remedy="ingest the seconds with cadence = 'minute'"
         if cadence < 60.0
         else "use minute or hourly values",
     )

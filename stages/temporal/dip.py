@@ -18,4 +18,4 @@ def dip_latitude(latitude: Real, longitude: Real, height: Real, date: np.datetim
     under the equatorial electrojet. Raises QueryError for a date the IGRF does not cover.
     """
     north, east, down = np.moveaxis(evaluate(igrf(), latitude, longitude, height, date), -1, 0)
-    return np.degrees(np.arctan2(down, 2.0 * np.hypot(north, east)))
+    return np.asarray(np.degrees(np.arctan2(down, 2.0 * np.hypot(north, east))), np.float64)

@@ -194,7 +194,7 @@ BAD = {
         "no month has 3 usable quiet days; the best has [12]; expected whole local days"),
     "no whole day": (times("2024-01-01", "2024-01-02", 3600.0), 3600.0, "the best has 0"),
     "seconds": (times("2024-01-01", "2024-01-02", 30.0), 30.0,
-        "cadence_s: one value every 30 s; .*reduce seconds to minutes"),
+        "cadence_s: one value every 30 s; .*cadence = 'minute'"),
     "three hours": (times("2024-01-01", "2024-02-01", 10800.0), 10800.0,
         "one value every 10800 s; expected from a minute to an hour"),
     "seven minutes": (times("2024-01-01", "2024-01-20", 420.0), 420.0,
