@@ -48,7 +48,8 @@ def assemble_temporal(
         result[name].values for name in ("latitude", "longitude", "elevation")
     )
     result["dip_latitude"].values = dip_latitude(latitude, longitude, elevation, _middle(result))
-    return result.assign_attrs(_attributes(models))
+    result.attrs = _attributes(models)
+    return result
 
 
 def _keyed(model: xr.Dataset) -> xr.Dataset:

@@ -95,7 +95,9 @@ def test_observatories_months_and_segments_are_united() -> None:
     np.testing.assert_array_equal(made["tau_unidentified"].values[:, 0], [[0, 0, 1], [1, 0, 0]])
     assert made["class_segments"].dtype == np.int32
     assert made["class_kp"].values.tolist() == [-1, 1]
-    assert made.attrs["segment_s"] == 10800.0
+    assert (made.attrs["segment_s"], made.attrs["cadence_s"]) == (10800.0, 3600.0)
+    minutes = assembled(kou, of_bou.assign_attrs(cadence_s=60.0))
+    assert "cadence_s" not in minutes.attrs
     assert made["quiet_day_choice"].attrs["flag_meanings"].startswith("list kp record")
     assert made.attrs["source"].split("; ")[0] == "KOU from 2024-02-01"
 
