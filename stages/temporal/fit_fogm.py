@@ -7,6 +7,7 @@ segments of three hours (Canciani and Raquet 2016, "Temporal Variation Parameter
 from __future__ import annotations
 
 import itertools
+import logging
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -26,6 +27,8 @@ from magtiles.stages.temporal.fogm import (
 from magtiles.stages.temporal.persistence import persistence
 from magtiles.stages.temporal.record import ELEMENTS
 from magtiles.stages.temporal.residual import Segments, cut, own_baseline, residual
+
+_LOG = logging.getLogger(__name__)
 
 Floats = NDArray[np.float64]
 Columns = dict[str, NDArray[np.float64]]
@@ -121,10 +124,9 @@ def segment_kp(middle: NDArray[np.datetime64], index: xr.Dataset | None) -> Floa
     Raises ContractError where an index is given that has Kp for none of them.
     """
     kp = np.full(middle.shape, np.nan)
-    if index is None:
+    if index is None or "kp" not in index:
+        _LOG.warning("no index has Kp: nothing is told of quiet and stormy segments")
         return kp
-    if "kp" not in index:
-        raise ContractError("'kp' is missing", where="index", remedy="give an index with Kp")
     begin, known = index["time"].values, index["kp"].values
     interval = np.timedelta64(round(float(index.attrs["cadence_s"]) * 1e9), "ns")
     at = np.searchsorted(begin, middle, side="right") - 1
@@ -137,6 +139,8 @@ def segment_kp(middle: NDArray[np.datetime64], index: xr.Dataset | None) -> Floa
             expected="Kp of the time of the series",
             remedy="ingest the index of those months, or leave it out",
         )
+    if unknown := np.count_nonzero(np.isnan(kp)):
+        _LOG.warning("%d of %d segments have no Kp", unknown, kp.size)
     return kp
 
 
