@@ -6,6 +6,7 @@ declination in tenths of arcminutes, from which a reported D or E counts.
 
 from __future__ import annotations
 
+import datetime
 import re
 from pathlib import Path
 
@@ -13,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtiles.schemas.errors import FormatError, SourceError
-from magtiles.stages.ingest.observatory.decimals import fixed_point, whole_numbers
 from magtiles.stages.ingest.observatory.record import (
     Header,
     Real,
@@ -23,13 +23,7 @@ from magtiles.stages.ingest.observatory.record import (
     mark_missing,
 )
 
-_CHUNK = 16384
-"""Rows decoded at once: their bytes stay in the processor's cache."""
-
-_NUMBERS = {"year": (0, 4), "month": (5, 7), "day": (8, 10), "hour": (11, 13), "minute": (14, 16)}
-_NUMBERS |= {"second": (17, 19), "millisecond": (20, 23), "doy": (24, 27)}
-_SIGNS = {4: "-", 7: "-", 10: " ", 13: ":", 16: ":", 19: ".", 23: " "}
-_FIRST_VALUE, _FIELD, _WIDTH, _POINT = 31, 10, 9, 6  # F9.2, a blank between
+_HEADER_BYTES = 65536
 
 _DECBAS = re.compile(r"#\s*DECBAS\s+(-?\d+)")
 _ELEMENT = re.compile(r"NUL|[A-Z]")
@@ -48,7 +42,11 @@ def read_iaga2002(content: bytes, path: Path) -> Record:
     backwards, a change of cadence. SourceError where columns are another station's.
     """
     header, begin, line = _header(content, path)
-    values, time, lines = _rows(content[begin:], len(header.elements), path, line)
+    found = _bulk(content, begin, len(header.elements))
+    if found is None:  # some line is unlike the first: find it, or read all by their words
+        found = _line_by_line(content[begin:], len(header.elements), path, line)
+    values, time, skipped = found
+    lines = line + 1 + np.arange(time.size) if skipped is None else skipped
     values, marked, never = mark_missing(values, header.elements)
     cadence = check_times(time, str(path), lines)
     return Record(str(path), header, time, values, marked, cadence, never)
@@ -58,7 +56,7 @@ def _header(content: bytes, path: Path) -> tuple[Header, int, int]:
     """What the header says, where the rows begin, and the number of the line before them."""
     fields: dict[str, str] = {}
     base, position = None, 0
-    for number, raw in enumerate(content.split(b"\n", 200)[:200], start=1):
+    for number, raw in enumerate(content[:_HEADER_BYTES].split(b"\n"), start=1):
         line = raw.decode("latin-1").rstrip("\r")
         position += len(raw) + 1
         if line.upper().startswith("DATE"):
@@ -122,89 +120,46 @@ def _number(fields: dict[str, str], name: str, path: Path) -> float | None:
         ) from None
 
 
-def _rows(body: bytes, count: int, path: Path, line: int) -> tuple[Real, Times, NDArray[np.int64]]:
-    """Values (elements, rows), times (rows,) and line numbers of the rows below line `line`."""
-    found = _bulk(body, count)
-    if found is None:  # some line is unlike the first: find it, or read it by its words
-        return _line_by_line(body, count, path, line)
-    values, numbers = found
-    lines = line + 1 + np.arange(values.shape[1])
-    return values, _times(numbers, path, lines), lines
+_Rows = tuple[Real, Times, NDArray[np.int64] | None]
+"""Values (elements, rows), times (rows,) and the rows' lines; None for one line each."""
 
 
-def _bulk(body: bytes, count: int) -> tuple[Real, dict[str, NDArray[np.int32]]] | None:
-    """Values and date numbers of equally long lines in the format's columns; else None."""
-    width = body.find(b"\n") + 1
-    if width == 0 or len(body) % width:
+def _bulk(content: bytes, begin: int, count: int) -> _Rows | None:
+    """Equally long rows in the format's columns, from byte `begin` on; else None."""
+    from magtiles.stages.ingest.observatory.iaga2002_compiled import (
+        FIELD,
+        FIRST_VALUE,
+        parse_rows,
+    )
+
+    width = content.find(b"\n", begin) + 1 - begin
+    if width <= 0 or (len(content) - begin) % width:
         return None
-    block = np.frombuffer(body, np.uint8).reshape(-1, width)
-    end = _FIRST_VALUE + count * _FIELD - 1
-    tail = width - 1 - (block[0, -2] == ord("\r"))
-    if tail < end:
+    text = np.frombuffer(content, np.uint8)
+    tail = width - 1 - int(content[begin + width - 2 : begin + width] == b"\r\n")
+    if tail < FIRST_VALUE + count * FIELD - 1:
         return None
-    blanks = [*range(27, _FIRST_VALUE), *range(end, tail)]
-    blanks += [_FIRST_VALUE + i * _FIELD - 1 for i in range(1, count)]
-    signs = {**_SIGNS, **dict.fromkeys(blanks, " "), width - 1: "\n"}
-    at, expected = np.array(list(signs)), np.array([ord(c) for c in signs.values()], np.uint8)
-    values = np.empty((count, len(block)))
-    numbers = {name: np.empty(len(block), np.int32) for name in _NUMBERS}
-    for start in range(0, len(block), _CHUNK):
-        part = slice(start, start + _CHUNK)
-        columns = np.ascontiguousarray(block[part].T)
-        good = bool((columns[at] == expected[:, None]).all())
-        for name, (first, last) in _NUMBERS.items():
-            numbers[name][part], fits = whole_numbers(columns[first:last])
-            good = good and fits
-        for i in range(count):
-            first = _FIRST_VALUE + i * _FIELD
-            values[i, part], fits = fixed_point(columns[first : first + _WIDTH], _POINT)
-            good = good and fits
-        if not good:
-            return None
-    return values, numbers
+    rows = (len(content) - begin) // width
+    time, values = np.empty(rows, np.int64), np.empty((count, rows))
+    if parse_rows(text, begin, width, tail, time, values) >= 0:
+        return None
+    time *= 1_000_000
+    return values, time.view("datetime64[ns]"), None
 
 
-def _times(numbers: dict[str, NDArray[np.int32]], path: Path, lines: NDArray[np.int64]) -> Times:
-    """Times (rows,) of date numbers. Raises FormatError naming the line of an impossible one."""
-    date = (numbers["year"] * 100 + numbers["month"]) * 100 + numbers["day"]
-    begins = np.flatnonzero(np.diff(date, prepend=-1))
-    year, month, day = (numbers[n][begins].astype(np.int64) for n in ("year", "month", "day"))
-    months = ((year - 1970) * 12 + month - 1).astype("datetime64[M]")
-    days = months.astype("datetime64[D]") + (day - 1)
-    wrong = (month < 1) | (month > 12) | (day < 1) | (days.astype("datetime64[M]") != months)
-    of_day = np.repeat(np.arange(begins.size), np.diff(np.append(begins, date.size)))
-    since = (days - days.astype("datetime64[Y]")).astype(np.int64) + 1
-    late = (numbers["hour"] > 23) | (numbers["minute"] > 59) | (numbers["second"] > 59)
-    bad = wrong[of_day] | (since[of_day] != numbers["doy"]) | late
-    if bad.any():
-        row = int(np.argmax(bad))
-        raise FormatError(
-            "no such time: " + " ".join(f"{k} {v[row]}" for k, v in numbers.items()),
-            where=f"{path} line {lines[row]}",
-            expected="a date with its day of the year (doy), and a time of day",
-            remedy="the line is damaged: fetch the file again",
-        )
-    ms = (numbers["hour"] * 60 + numbers["minute"]) * 60 + numbers["second"]
-    ms = ms.astype(np.int64) * 1000 + numbers["millisecond"]
-    nanoseconds = days.astype("datetime64[ns]").astype(np.int64)[of_day] + ms * 1_000_000
-    return nanoseconds.astype("datetime64[ns]")
-
-
-def _line_by_line(
-    body: bytes, count: int, path: Path, line: int
-) -> tuple[Real, Times, NDArray[np.int64]]:
-    """As `_rows`, for columns of other widths. Raises FormatError naming the first bad line."""
+def _line_by_line(body: bytes, count: int, path: Path, line: int) -> _Rows:
+    """Rows of other columns. Raises FormatError naming the first bad line."""
     values, stamps, lines = [], [], []
-    longest = 0
+    length = 0
     for number, raw in enumerate(body.decode("latin-1").splitlines(), start=line + 1):
         text = raw.rstrip(" \r|\x1a")
         if not text:
             continue
         words = text.split()
-        longest = longest or len(text)
-        if len(words) != 3 + count or len(text) < longest:
+        length = length or len(text)
+        if len(words) != 3 + count or len(text) < length:
             raise FormatError(
-                f"the line is truncated: '{text}'" if len(text) < longest else f"found '{text}'",
+                f"the line is truncated: '{text}'" if len(text) < length else f"found '{text}'",
                 where=f"{path} line {number}",
                 expected=f"date, time, day of the year and {count} values, as in the lines before",
                 remedy="the file is incomplete or damaged: fetch it again",
@@ -214,11 +169,7 @@ def _line_by_line(
         lines.append(number)
     if not lines:
         raise FormatError("has no data", where=path, remedy="fetch it again")
-    rows = np.array(lines, np.int64)
-    numbers = {
-        n: np.array(v, np.int32) for n, v in zip(_NUMBERS, zip(*stamps, strict=True), strict=True)
-    }
-    return np.array(values).T.copy(), _times(numbers, path, rows), rows
+    return np.array(values).T.copy(), np.array(stamps, "datetime64[ns]"), np.array(lines)
 
 
 def _floats(words: list[str], where: str) -> list[float]:
@@ -235,14 +186,16 @@ def _floats(words: list[str], where: str) -> list[float]:
     return values
 
 
-def _stamp(words: list[str], where: str) -> list[int]:
-    match = re.fullmatch(
-        r"(\d{4})-(\d\d)-(\d\d) (\d\d):(\d\d):(\d\d)\.(\d{3}) (\d{3})", " ".join(words)
-    )
-    if match is None:
+def _stamp(words: list[str], where: str) -> datetime.datetime:
+    try:
+        time = datetime.datetime.strptime(" ".join(words[:2]), "%Y-%m-%d %H:%M:%S.%f")  # noqa: DTZ007
+    except ValueError:
+        time = None
+    if time is None or str(time.timetuple().tm_yday) != words[2].lstrip("0"):
         raise FormatError(
-            f"the line begins with '{' '.join(words)}'",
+            f"no such time: '{' '.join(words)}'",
             where=where,
-            expected="date, time and day of the year, such as 2016-01-01 00:00:00.000 001",
+            expected="a date, a time and the day of the year, as 2016-01-01 00:00:00.000 001",
+            remedy="the line is damaged: fetch the file again",
         )
-    return [int(group) for group in match.groups()]
+    return time

@@ -79,14 +79,17 @@ def mark_missing(
     `values` is (elements, rows) as the file has it. An element that is `absent` (or missing, for
     NUL) throughout is no reason to mark a row.
     """
-    is_absent = values == absent
-    is_missing = values == missing
-    never = is_absent.all(axis=1) | np.array([e == "NUL" for e in elements])
-    marked = (is_absent | is_missing)[~never].any(axis=0)
-    values[is_absent | is_missing] = np.nan
-    values[never] = np.nan
+    marks = (values == absent) | (values == missing)
+    rows = marks.any(axis=0)
+    if not rows.any():
+        return values, rows, ()
+    always = marks.all(axis=1)
+    is_nul = np.array([element == "NUL" for element in elements])
+    never = is_nul | (always & (values[:, 0] == absent))
+    values[marks] = np.nan
+    values[is_nul] = np.nan
     names = tuple(e for e, gone in zip(elements, never, strict=True) if gone and e != "NUL")
-    return values, marked, names
+    return values, marks[~never].any(axis=0), names
 
 
 def check_times(time: Times, where: str, lines: NDArray[np.int64]) -> float | None:
@@ -96,9 +99,11 @@ def check_times(time: Times, where: str, lines: NDArray[np.int64]) -> float | No
     line, where time stands still or goes backwards and where the spacing changes. A gap is a
     multiple of the usual spacing.
     """
-    steps = np.diff(time).astype("timedelta64[ms]").astype(np.int64)
+    steps = np.diff(time.astype("datetime64[ns]").view(np.int64))
     if not steps.size:
         return None
+    if steps[0] > 0 and (steps == steps[0]).all():
+        return float(steps[0]) / 1e9
     if (steps <= 0).any():
         row = int(np.argmax(steps <= 0)) + 1
         again = "is repeated" if steps[row - 1] == 0 else f"follows {time[row - 1]}"
@@ -113,17 +118,15 @@ def check_times(time: Times, where: str, lines: NDArray[np.int64]) -> float | No
     if odd.any():
         row = int(np.argmax(odd)) + 1
         raise FormatError(
-            f"mixed cadence: {steps[row - 1] / 1000:g} s after the row before",
+            f"mixed cadence: {steps[row - 1] / 1e9:g} s after the row before",
             where=f"{where} line {lines[row]}",
-            expected=f"{usual / 1000:g} s, or a multiple for a gap",
+            expected=f"{usual / 1e9:g} s, or a multiple for a gap",
             remedy="ingest each cadence from files of its own",
         )
-    return usual / 1000.0
+    return usual / 1e9
 
 
 def _most_frequent(steps: NDArray[np.int64]) -> int:
-    if (steps == steps[0]).all():
-        return int(steps[0])
     found, counts = np.unique(steps, return_counts=True)
     return int(found[np.argmax(counts)])
 

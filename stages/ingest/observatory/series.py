@@ -63,23 +63,14 @@ def combine(records: Sequence[Record], fields: Sequence[Field]) -> Combined:
     pairs = sorted(zip(records, fields, strict=True), key=lambda pair: _level(pair[0]))
     for record, field in pairs:
         at = _place(record, time, cadence)
-        new = field.values.copy()
         if has_scalar and field.total == "vector":
-            new[3] = np.nan  # a magnitude among scalars would be a step
-        old, below = values[:, at], level[at]
-        there, same_level = below >= 0, below == _level(record)
-        new = np.where(same_level & np.isnan(new), old, new)
-        agree = (np.abs(new - old) <= _SAME_NT) | (np.isnan(new) & np.isnan(old))
-        agree |= same_level & np.isnan(old)
-        differs = there & ~agree.all(axis=0)
-        duplicates += int((there & ~differs).sum())
+            field.values[3] = np.nan  # a magnitude among scalars would be a step
         marks = np.where(record.marked, np.uint8(RecordFlag.MISSING_MARK), np.uint8(0))
-        # Where one of two rows of a level is whole, the mark of the other means nothing.
-        marks[np.isfinite(new).all(axis=0)] = 0
-        kept = flags[at] & np.uint8(RecordFlag.OVERLAP_RESOLVED)
-        flags[at] = marks | kept | np.where(differs, np.uint8(RecordFlag.OVERLAP_RESOLVED), 0)
-        values[:, at], level[at] = new, _level(record)
-        _report(record, there, differs)
+        if (level[at] < 0).all():
+            values[:, at], flags[at] = field.values, marks
+        else:
+            duplicates += _overlay(record, field, values, flags, level, at, marks)
+        level[at] = _level(record)
     return Combined(
         time=time,
         values=values,
@@ -89,6 +80,31 @@ def combine(records: Sequence[Record], fields: Sequence[Field]) -> Combined:
         resolved=int(((flags & RecordFlag.OVERLAP_RESOLVED) != 0).sum()),
         gaps=int((level < 0).sum()),
     )
+
+
+def _overlay(
+    record: Record,
+    field: Field,
+    values: Real,
+    flags: NDArray[np.uint8],
+    level: NDArray[np.int8],
+    at: slice | NDArray[np.int64],
+    marks: NDArray[np.uint8],
+) -> int:
+    """Put a record over samples of which some are there; how many of those are the same."""
+    old, there = values[:, at], level[at] >= 0
+    same_level = level[at] == _level(record)
+    new = np.where(same_level & np.isnan(field.values), old, field.values)
+    agree = (np.abs(new - old) <= _SAME_NT) | (np.isnan(new) & np.isnan(old))
+    agree |= same_level & np.isnan(old)
+    differs = there & ~agree.all(axis=0)
+    marks[np.isfinite(new).all(axis=0)] = 0  # filled from the other row
+    kept = flags[at] & np.uint8(RecordFlag.OVERLAP_RESOLVED)
+    resolved = np.where(differs, np.uint8(RecordFlag.OVERLAP_RESOLVED), np.uint8(0))
+    flags[at] = marks | kept | resolved
+    values[:, at] = new
+    _report(record, there, differs)
+    return int((there & ~differs).sum())
 
 
 def _level(record: Record) -> int:
@@ -134,7 +150,7 @@ def _cadence(records: Sequence[Record]) -> float:
 def _grid(records: Sequence[Record], cadence: float) -> Times:
     begin = min(record.time[0] for record in records)
     end = max(record.time[-1] for record in records)
-    step = np.timedelta64(round(cadence * 1e3), "ms")
+    step = np.timedelta64(round(cadence * 1e9), "ns")
     count = int((end - begin) // step) + 1
     if count > _MOST_SAMPLES:
         raise FormatError(
@@ -146,11 +162,11 @@ def _grid(records: Sequence[Record], cadence: float) -> Times:
     return begin + np.arange(count) * step
 
 
-def _place(record: Record, time: Times, cadence: float) -> NDArray[np.int64]:
-    """Samples of the grid that a record's rows are."""
+def _place(record: Record, time: Times, cadence: float) -> slice | NDArray[np.int64]:
+    """Samples of the grid that a record's rows are: a slice where the record has no gaps."""
     step = round(cadence * 1e9)
-    since = (record.time - time[0]).astype("timedelta64[ns]").astype(np.int64)
-    off = since % step != 0
+    since = record.time.view(np.int64) - time[0].astype(np.int64)
+    off = since % step != 0 if record.cadence_s is None else since[:1] % step != 0
     if off.any():
         raise FormatError(
             f"mixed cadence: {record.time[int(np.argmax(off))]} is no multiple of {cadence:g} s "
@@ -159,4 +175,5 @@ def _place(record: Record, time: Times, cadence: float) -> NDArray[np.int64]:
             expected="times on the grid of the other files",
             remedy="ingest each on its own",
         )
-    return since // step
+    first, last = int(since[0]) // step, int(since[-1]) // step
+    return slice(first, last + 1) if last - first + 1 == since.size else since // step

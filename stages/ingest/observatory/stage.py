@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -104,7 +105,8 @@ def ingest_observatory(files: Sequence[Path], *, params: IngestObservatoryParams
     paths, source = locate_all([Path(f) for f in files], OBSERVATORY_SERIES)
     where = "parameters" if source is None else f"{source.path} [series]"
     params = merge(params, source)
-    records = [_read(path) for path in paths]
+    with ThreadPoolExecutor() as pool:  # reading and parsing hold no interpreter lock
+        records = list(pool.map(_read, paths))
     station = _station(records, params, where)
     fields = [to_field(record, station) for record in records]
     combined = combine(records, fields)

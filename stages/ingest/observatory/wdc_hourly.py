@@ -82,6 +82,7 @@ def _record(code: str, days: dict[tuple[str, datetime.date], _Day], path: Path) 
         values[elements.index(element), hours] = day.values
         marked[hours] |= np.isnan(day.values)
     time = np.datetime64(begin, "ns") + _HOUR // 2 + np.arange(count * 24) * _HOUR
+
     return Record(str(path), Header(code, elements), time, values, marked, 3600.0)
 
 
