@@ -31,7 +31,8 @@ def run(path: Path, *, as_json: bool) -> int:
 def _print_summary(summary: LogSummary, path: Path) -> None:
     from magtiles.stages.ingest.log.summary import shown
 
-    print(f"{path}: {summary.format}, {len(summary.topics)} topics")
+    count = len(summary.topics)
+    print(f"{path}: {summary.format}, {count} topic{'' if count == 1 else 's'}")
     if summary.truncated_at_byte is not None:
         print(f"truncated after byte {summary.truncated_at_byte}; this is what can be recovered")
     if not summary.topics:

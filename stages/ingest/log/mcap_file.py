@@ -95,10 +95,10 @@ class McapFile:
             yield from loose.flush()
 
     def _records(self, file: BinaryIO) -> Iterator[tuple[int, int, bytes]]:
-        """Offset, opcode and content of each record up to the footer."""
+        """Offset, opcode and content of each record of the data section."""
         size = self.path.stat().st_size
         stream = ReadDataStream(cast(IO[bytes], _Exact(file, size)), calculate_crc=True)
-        offset = 0
+        offset, in_data = 0, True
         try:
             stream.read(_MAGIC_BYTES)
             while True:
@@ -107,11 +107,13 @@ class McapFile:
                 payload = stream.read(length)
                 if opcode == Opcode.DATA_END:
                     self._check_data(_parse(DataEnd.read, payload, f"byte {offset}"), crc, offset)
+                    in_data = False  # what follows repeats and counts what came before
                 if opcode == Opcode.FOOTER:
                     _parse(Footer.read, payload, f"{self.path} byte {offset}")
                     stream.read(_MAGIC_BYTES)
                     return
-                yield offset, opcode, payload
+                if in_data:
+                    yield offset, opcode, payload
         except EndOfFile:
             self.truncated = offset
 

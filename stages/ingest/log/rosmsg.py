@@ -119,8 +119,6 @@ def _flatten(
             out.append(Leaf(path, inner, None, sequence_of_messages=True))
             continue
         for item in range(count):
-            if len(out) > _MOST_FIELDS:
-                break
             inside = f"{path}.{item}." if is_array else f"{path}."
             _flatten(inner, inside, types, out, where, depth=depth + 1)
 

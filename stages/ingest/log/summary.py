@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -209,7 +208,8 @@ def shown(values: tuple[Value, ...]) -> str:
     """First values as one line of text, without the part of their names that all share."""
     units = {value.unit for value in values}
     common = len(units) == 1
-    start = os.path.commonprefix([value.name for value in values]).rfind(".") + 1
+    parents = {value.name.rpartition(".")[0] for value in values}
+    start = len(parents.pop()) + 1 if len(parents) == 1 and "" not in parents else 0
     parts = [
         f"{value.name[start:]} {value.value:.9g}"
         + ("" if common or value.unit in (None, "1") else f" {value.unit}")
