@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import logging
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -31,7 +32,7 @@ from magtiles.stages.temporal.residual import Segments, cut, own_baseline, resid
 _LOG = logging.getLogger(__name__)
 
 Floats = NDArray[np.float64]
-Columns = dict[str, NDArray[np.float64]]
+Columns = dict[str, NDArray[Any]]
 
 PLACE = ("iaga_code", "latitude", "longitude", "elevation", "dip_latitude")
 PREDICTED = ("level", "sigma", "tau", "sigma_autocorrelation", "tau_autocorrelation")
@@ -127,10 +128,12 @@ def segment_kp(middle: NDArray[np.datetime64], index: xr.Dataset | None) -> Floa
     if index is None or "kp" not in index:
         _LOG.warning("no index has Kp: nothing is told of quiet and stormy segments")
         return kp
-    begin, known = index["time"].values, index["kp"].values
+    begin: NDArray[np.datetime64] = index["time"].values
+    known = index["kp"].values
     interval = np.timedelta64(round(float(index.attrs["cadence_s"]) * 1e9), "ns")
     at = np.searchsorted(begin, middle, side="right") - 1
-    inside = (at >= 0) & (middle < begin[at] + interval)
+    end = begin + interval
+    inside = (at >= 0) & (middle < end[at])
     kp[inside] = known[at[inside]]
     if np.isnan(kp).all():
         raise ContractError(

@@ -147,9 +147,9 @@ def cut(values: Floats, time: Times, step_s: float, segment_s: float) -> Segment
     filled = np.full((len(values), begins.size * (length // step)), np.nan)
     for place, record in zip(filled, values, strict=True):
         place[column] = record
-    filled = filled.reshape(len(values), begins.size, -1)
-    kept = np.isfinite(filled).any(axis=(0, 2))
-    return Segments((number[kept] * length).astype("datetime64[ns]"), filled[:, kept], step_s)
+    parts = filled.reshape(len(values), begins.size, -1)
+    kept = np.isfinite(parts).any(axis=(0, 2))
+    return Segments((number[kept] * length).astype("datetime64[ns]"), parts[:, kept], step_s)
 
 
 def _check_steps(at: NDArray[np.int64], step: int) -> None:
