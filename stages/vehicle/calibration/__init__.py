@@ -1,0 +1,1 @@
+"""Calibration of vector magnetometers: bias, scale factors and distortion from motion."""
