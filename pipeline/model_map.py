@@ -100,6 +100,8 @@ def _level(
 def _files(source: ModelMap, data: Path | None) -> _Files:
     """The coefficient files: in `data` where it is given, else where the product says."""
     files = source.files if data is None else tuple(data / file.name for file in source.files)
+    if not files:
+        raise SourceError("holds no coefficient files", where=source.path, expected="*.COF")
     missing = [file for file in files if not file.is_file()]
     if missing:
         raise SourceError(

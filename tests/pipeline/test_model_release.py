@@ -222,6 +222,19 @@ def test_sample_files_are_the_same_every_time(tmp_path):
     np.testing.assert_array_equal(read.secular_variation, made.secular_variation)
 
 
+def test_the_sample_command_writes_a_world(tmp_path, capsys):
+    assert main(["sample", str(tmp_path)]) == 0
+    written = capsys.readouterr().out.split()
+    names = ["world.COF", "world-model.toml", "world.toml"]
+    assert [Path(path).name for path in written[-3:]] == names
+
+
+def test_a_folder_without_coefficients(site, capsys):
+    (site / "empty").mkdir()
+    said = message(site, capsys, '"coarse-model.toml"', '"empty"')
+    assert "empty: holds no coefficient files" in said
+
+
 @pytest.fixture
 def site(tmp_path) -> Path:
     """A folder with the sample model's files, to be spoilt."""
