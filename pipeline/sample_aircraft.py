@@ -203,8 +203,9 @@ def _turn(angle_deg: float, rate_deg_s: float, step: float) -> Floats:
     """Rate of a turn through `angle_deg`, degrees per second, smooth where it begins and ends."""
     ramp = np.sin(np.linspace(0.0, 0.5 * np.pi, round(6.0 / step))) ** 2
     steady = abs(angle_deg) / (rate_deg_s * step) - ramp.sum() * 2.0
-    rate = np.concatenate([ramp, np.ones(round(steady)), ramp[::-1]])
-    return rate * angle_deg / (rate.sum() * step)
+    shape = np.concatenate([ramp, np.ones(round(steady)), ramp[::-1]])
+    rate: Floats = shape * angle_deg / (shape.sum() * step)
+    return rate
 
 
 def _path(aircraft: Aircraft, heading: Floats) -> tuple[Floats, Floats, Floats]:

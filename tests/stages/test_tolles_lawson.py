@@ -56,7 +56,7 @@ def cloverleaf() -> xr.Dataset:
 
 def test_columns_are_those_of_the_paper():
     body = body_field(angles())
-    columns = dict(zip(TERMS, term_columns(body, STEP_S, TERMS).T, strict=True))
+    columns = dict(zip(TERMS, term_columns(body, STEP_S, TERMS, span_s=0.0).T, strict=True))
     length = np.linalg.norm(body, axis=1)
     u = body / length[:, None]
     x, y, z = u.T
@@ -76,12 +76,33 @@ def test_columns_are_those_of_the_paper():
 
 def test_derivative_has_the_error_of_fourth_order_differences():
     t = np.arange(200) * STEP_S
-    np.testing.assert_allclose(derivative(t**4, STEP_S), 4.0 * t**3, rtol=1e-9, atol=1e-8)
+    for span in (0.0, 0.8):
+        found = derivative(t**4, STEP_S, span)
+        np.testing.assert_allclose(found, 4.0 * t**3, rtol=1e-9, atol=1e-7)
     for hz in (0.25, 0.5):
-        found = derivative(np.sin(2.0 * np.pi * hz * t), STEP_S)
         exact = 2.0 * np.pi * hz * np.cos(2.0 * np.pi * hz * t)
-        error = np.abs(found - exact)[2:-2].max() / exact.max()
-        assert error == pytest.approx((2.0 * np.pi * hz * STEP_S) ** 4 / 30.0, rel=0.1)
+        for span, relative in (
+            (0.0, (2.0 * np.pi * hz * STEP_S) ** 4 / 30.0),
+            (0.8, 0.098 * hz**4),
+        ):
+            found = derivative(np.sin(2.0 * np.pi * hz * t), STEP_S, span)
+            error = np.abs(found - exact)[4:-4].max() / exact.max()
+            assert error == pytest.approx(relative, rel=0.1)
+
+
+def test_a_wider_span_passes_less_noise():
+    """At the same span the noise falls with the sampling rate, as it should."""
+    rng = np.random.default_rng(0)
+    passed = {
+        (step, span): np.std(derivative(rng.normal(size=20_000), step, span))
+        for step in (0.1, 0.05, 0.5)
+        for span in (0.0, 0.8)
+    }
+    assert passed[0.1, 0.8] == pytest.approx(3.38, rel=0.03)
+    assert passed[0.1, 0.0] == pytest.approx(9.50, rel=0.03)
+    assert passed[0.05, 0.8] < 0.85 * passed[0.1, 0.8] < 0.2 * passed[0.05, 0.0]
+    assert passed[0.5, 0.8] == pytest.approx(passed[0.5, 0.0], rel=0.05)  # five samples either way
+    assert np.isfinite(derivative(np.arange(6.0), 0.1)).all()  # a run shorter than the span
 
 
 @pytest.mark.parametrize("of", ["direction_cosines", "field_components"])
@@ -112,7 +133,7 @@ def distance_modulo_null(found: xr.Dataset) -> float:
 @pytest.mark.parametrize("of", ["direction_cosines", "field_components"])
 @pytest.mark.parametrize(("induced", "eddy"), [(5, 8), (6, 9), (5, 9), (6, 8)])
 def test_linear_truth_is_found_modulo_null_directions(induced, eddy, of, form):
-    """Measured: coefficients within 5e-11 of the largest, compensation within 5e-10 nT."""
+    """Measured: coefficients within 8e-11 of the largest, compensation within 3e-10 nT."""
     track = flight(angles(), of)
     found = fit(track, induced_terms=induced, eddy_terms=eddy, derivative_of=of, form=form)
     contracts.check(found, "sensor-calibration/1")
@@ -264,8 +285,8 @@ def test_a_gap_is_missing_and_flagged_and_the_rest_compensated(cloverleaf):
     flags = compensated["quality_flag"].values
     np.testing.assert_array_equal((flags & TrackFlag.FIELD_GAP) != 0, missing)
     assert ((flags & TrackFlag.STATIONARY) != 0).all()
-    # Differences at the edges of the gap are one-sided: 1e-6 nT there, not 1e-10.
-    assert np.nanstd(compensated["field_total"]) < 1e-5
+    # Differences at the edges of the gap are one-sided: 2e-4 nT rms, 0.02 at most.
+    assert np.nanstd(compensated["field_total"]) < 5e-4
     swinging = (flags & TrackFlag.MANOEUVRE) != 0
     assert 0.3 < swinging.mean() < 0.5
     np.testing.assert_array_equal(compensated["field_total_raw"], broken["field_total"])

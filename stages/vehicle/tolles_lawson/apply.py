@@ -52,10 +52,9 @@ def apply_tolles_lawson(
     usable = np.isfinite(measured) & np.isfinite(direction_cosines(body)).all(axis=1)
     runs = find_runs(track, usable, SHORTEST)
     own = np.full(measured.shape, np.nan)
+    of, span_s = (calibration.attrs[f"derivative_{key}"] for key in ("of", "span_s"))
     for run in runs:
-        columns = term_columns(
-            body[run.rows], run.step_s, names, calibration.attrs["derivative_of"]
-        )
+        columns = term_columns(body[run.rows], run.step_s, names, of, span_s)
         own[run.rows] = columns @ calibration["coefficient"].values
     compensated = measured - (own - float(calibration["level"]))
     swings = mark(find_manoeuvres(track, runs, params.least_swing_deg), measured.size)

@@ -23,6 +23,7 @@ from magtiles.stages.vehicle.tolles_lawson.merit import measure
 from magtiles.stages.vehicle.tolles_lawson.runs import Run, find_runs
 from magtiles.stages.vehicle.tolles_lawson.solve import Regularisation, Solution, solve
 from magtiles.stages.vehicle.tolles_lawson.terms import (
+    DERIVATIVE_SPAN_S,
     SHORTEST,
     Derivative,
     direction_cosines,
@@ -54,6 +55,9 @@ class FitTollesLawsonParams(Params):
     eddy_terms: Literal[8, 9] = quantity("1", default=8, doc="8 leaves out eddy_zz.")
     derivative_of: Derivative = quantity(
         "1", default="direction_cosines", doc="What eddy terms take the derivative of."
+    )
+    derivative_span_s: float = quantity(
+        "s", default=DERIVATIVE_SPAN_S, ge=0, doc="Samples that a derivative is fitted to."
     )
     band_hz: Annotated[tuple[float, float], pydantic.AfterValidator(_rising)] = quantity(
         "Hz", default=(0.1, 0.9), doc="Band of the manoeuvres, for the fit and the merits."
@@ -183,7 +187,7 @@ def _fit_filter(params: FitTollesLawsonParams) -> Filter:
 
 
 def _usable(track: xr.Dataset, params: FitTollesLawsonParams) -> NDArray[np.bool_]:
-    usable = np.isfinite(track["field_total"].values)
+    usable: NDArray[np.bool_] = np.isfinite(track["field_total"].values)
     usable &= np.isfinite(direction_cosines(_body(track))).all(axis=1)
     if params.form == "map_based":
         usable &= np.isfinite(track["expected_total"].values)
@@ -217,7 +221,9 @@ def _model(
     body = _body(track)
     columns = np.full((len(body), len(names)), np.nan)
     for run in runs:
-        columns[run.rows] = term_columns(body[run.rows], run.step_s, names, params.derivative_of)
+        columns[run.rows] = term_columns(
+            body[run.rows], run.step_s, names, params.derivative_of, params.derivative_span_s
+        )
     response = track["field_total"].values.astype(np.float64)
     if params.form == "map_based":
         response = response - track["expected_total"].values
@@ -335,7 +341,8 @@ def _record(
         "source": str(track.attrs["source"]),
         "method": f"Tolles-Lawson, {params.form.replace('_', '-')}",
         "derivative_of": params.derivative_of,
-        "derivative_scheme": "central differences of fourth order",
+        "derivative_scheme": "of quartics fitted by least squares (Savitzky-Golay)",
+        "derivative_span_s": params.derivative_span_s,
         "band_hz": list(params.band_hz),
         "low_pass_hz": "none" if params.low_pass_hz is None else params.low_pass_hz,
         "regularisation": f"singular values: least excitation {params.least_excitation:g}, "
