@@ -30,6 +30,7 @@ def write_observatories(folder: Path, name: str, sample: TemporalSample) -> list
     Returns the source TOMLs ``<name>-<code>.toml`` of the stations, then that of the indices,
     ``<name>-indices.toml``, then the data files. The same sample gives the same bytes.
     """
+    folder.mkdir(parents=True, exist_ok=True)
     tomls, data = [], []
     for number, spec in enumerate(sample.spec.stations):
         files = _write_records(folder, sample, sample.station(number))

@@ -22,6 +22,7 @@ from magtiles.catalog.releases.tile_table import LEVELS, UNITS
 from magtiles.pipeline.artifacts import open_artifact
 from magtiles.pipeline.overlaps import Overlaps
 from magtiles.pipeline.physics import GradientSums, add_gradients, projection_excess
+from magtiles.pipeline.temporal_checks import check_temporal
 from magtiles.schemas import contracts
 from magtiles.schemas.errors import MagtilesError
 from magtiles.stages.release.checks import CHECKS_NAME, TOLERANCE, replay_checks
@@ -63,6 +64,8 @@ def validate_release(folder: Path) -> list[Check]:
     checks.append(_check_digests(folder, manifest))
     checks.append(_check_units(manifest))
     checks += _check_tiles(folder, manifest)
+    if manifest.temporal is not None:
+        checks += _check_temporal(folder)
     checks.append(_check_answers(folder))
     return checks
 
@@ -112,6 +115,13 @@ def _check_answers(folder: Path) -> Check:
         return Check(CHECKS_NAME, False, None, 1.0, "of tolerance", str(problem))
     where = f"largest error of the reader's answers, relative to {TOLERANCE:g}"
     return Check(CHECKS_NAME, worst <= 1.0, worst, 1.0, "of tolerance", where)
+
+
+def _check_temporal(folder: Path) -> list[Check]:
+    try:
+        return [Check(**vars(finding)) for finding in check_temporal(open_release(folder))]
+    except MagtilesError as problem:
+        return [Check("temporal contract", False, None, None, "", str(problem))]
 
 
 def _counted(name: str, problems: list[str], unit: str, fine: str) -> Check:

@@ -15,6 +15,7 @@ from magtiles.pipeline.output import print_json, print_table
 if TYPE_CHECKING:
     from magtiles.catalog.releases.lattice import Lattice
     from magtiles.catalog.releases.manifest import Manifest
+    from magtiles.catalog.releases.reader import Release
 
 HELP = "say what a release or a log holds"
 NEEDS_PIPELINE = False
@@ -45,7 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
     release = open_release(arguments.release)
     for file in release.manifest.files:
         release.file(file.path)
-    described = describe(release.manifest)
+    described = describe(release.manifest) | {"temporal": describe_temporal(release)}
     if arguments.json:
         print_json(described)
     else:
@@ -83,6 +84,20 @@ def _longitudes(lattice: Lattice) -> list[float]:
     if lattice.east - lattice.west > 360.0 - 1e-9:
         return [-180.0, 180.0]
     return [_wrapped(lattice.west), _wrapped(lattice.east)]
+
+
+def describe_temporal(release: Release) -> dict[str, Any] | None:
+    """Observatories, months and number of segments of a temporal model; None without one."""
+    if release.manifest.temporal is None:
+        return None
+    model = release.temporal
+    segments = model.variables.get("segment_start")
+    return {
+        "observatories": [vars(observatory) for observatory in model.observatories],
+        "months": model.months.astype(str).tolist(),
+        "segments": 0 if segments is None else int(segments.size),
+        "array_digest": release.manifest.temporal.array_digest,
+    }
 
 
 def _wrapped(longitude: float) -> float:
@@ -139,6 +154,9 @@ def _print_described(about: dict[str, Any]) -> None:
     print()
     _print_levels(about)
     print()
+    if about["temporal"] is not None:
+        _print_temporal(about["temporal"])
+        print()
     shares = [(f"{share:.2%}", name) for name, share in about["flag_fractions"].items()]
     print_table(("nodes", "flag"), shares)
     print()
@@ -156,6 +174,17 @@ def _print_levels(about: dict[str, Any]) -> None:
         for name, unit in _UNCERTAINTIES.items()
     ]
     print_table(("level m", *titles), rows)
+
+
+def _print_temporal(temporal: dict[str, Any]) -> None:
+    rows = [
+        (o["code"], *(f"{o[k]:.2f}" for k in ("latitude", "longitude", "dip_latitude")))
+        for o in temporal["observatories"]
+    ]
+    print_table(("observatory", "latitude", "longitude", "dip latitude"), rows)
+    months = temporal["months"]
+    span = f"{months[0]} to {months[-1]}" if months else "none"
+    print(f"quiet-day curves: {span} ({len(months)}); FOGM segments: {temporal['segments']}")
 
 
 def _print_next(manifest: Manifest, folder: Path) -> None:

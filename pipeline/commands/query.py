@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from magtiles.catalog.flags import QualityFlag
 from magtiles.pipeline import model_query
 from magtiles.pipeline.output import print_json, print_table
+from magtiles.pipeline.temporal_query import print_temporal, temporal_answers
 from magtiles.schemas.errors import FormatError, UsageError
 
 if TYPE_CHECKING:
@@ -48,7 +49,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="DATE",
         help="ISO date or decimal year, UTC; one serves all positions. For a release it adds the "
-        "whole field: north, east, down of core and anomaly, and as total |core| + anomaly",
+        "whole field: north, east, down of core and anomaly, and as total |core| + anomaly; and "
+        "the quiet-day variation, sigma and tau, if it has a temporal model",
     )
     parser.add_argument(
         "--allow-extrapolated",
@@ -78,6 +80,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--height-above-reference",
         action="store_true",
         help="heights count from the release's own surface (terrain or sea level) instead",
+    )
+    parser.add_argument(
+        "--kp",
+        type=float,
+        metavar="KP",
+        help="Kp at the dates, 0 to 9, by which sigma and tau of the release are chosen",
     )
     parser.add_argument("--json", action="store_true", help="print JSON; missing is null")
 
@@ -111,11 +119,14 @@ def _ask_release(
                 where="--height-above-reference",
                 expected="heights above the ellipsoid, where a core field can be evaluated",
             )
+    elif arguments.kp is not None:
+        raise UsageError("given without --date", where="--kp", remedy="give --date")
     return answer(
         arguments.release,
         positions,
         above_reference=arguments.height_above_reference,
         dates=arguments.date,
+        kp=arguments.kp,
     )
 
 
@@ -124,6 +135,8 @@ def _ask_model(
 ) -> list[dict[str, Any]]:
     if arguments.height_above_reference:
         raise UsageError("given with a model", where="--height-above-reference")
+    if arguments.kp is not None:
+        raise UsageError("given with a model", where="--kp")
     _check_dates(arguments.date, len(positions))
     return model_query.answer(
         model_query.find_model(arguments.model),
@@ -148,11 +161,12 @@ def answer(
     *,
     above_reference: bool,
     dates: Sequence[str] = (),
+    kp: float | None = None,
 ) -> list[dict[str, Any]]:
     """What a release says at positions (n, 3): latitude, longitude (deg) and height (m).
 
     With one date, or one for each position, the field that is expected there: core and
-    anomaly. Without, its keys are None.
+    anomaly, and what its temporal model says. Without, these keys are None.
     """
     from magtiles.catalog import open_release
 
@@ -173,6 +187,7 @@ def answer(
     uncertainty = anomaly.uncertainty(**place)
     flags = anomaly.flags(**place)
     expected = _expected(anomaly, positions, dates) if dates else [dict.fromkeys(_CORE)]
+    temporal = temporal_answers(release, positions, dates, kp)
     return [
         {
             **dict(zip(_COLUMNS, map(float, positions[i]), strict=True)),
@@ -183,6 +198,7 @@ def answer(
             "anomaly_down": float(vector[i, 2]),
             "uncertainty": float(uncertainty[i]),
             "flags": flag_names(int(flags[i])),
+            "temporal": temporal[i],
         }
         for i in range(len(positions))
     ]
@@ -303,3 +319,4 @@ def _print_answers(answers: list[dict[str, Any]]) -> None:
         for a in answers
     ]
     print_table([*header, "1 sigma", *(units.get(k, k) for k in field), "flags"], rows)
+    print_temporal([a["temporal"] for a in answers])
