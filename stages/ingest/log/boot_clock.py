@@ -13,6 +13,8 @@ from magtiles.stages.vehicle.positions import Real, Times
 _CRYSTAL = 50e-6
 """Rates of uncompensated quartz clocks spread so; fixes of a short log say less than this."""
 _FINEST_S = 1e-3
+_ROUNDS = 3
+"""The spread of the fixes, which says what is an outlier, is known once the drift is."""
 
 
 @dataclass(frozen=True)
@@ -55,15 +57,20 @@ def fit_boot_clock(boot_us: NDArray[np.integer], utc_us: NDArray[np.integer]) ->
     middle = float(boot.mean() * 1e-6)
     apart = np.asarray((ahead_us - reference) * 1e-6, dtype=np.float64)
     since = np.asarray(boot * 1e-6 - middle, dtype=np.float64)
-    spread = max(_robust_sigma(apart), _FINEST_S)
+    line, left = np.zeros(2), _robust_sigma(apart)
+    for _ in range(_ROUNDS):
+        line = _fitted(line, since, apart, max(left, _FINEST_S))
+        left = _robust_sigma(apart - line[0] - line[1] * since)
+    return BootClock(reference * 1e-6 + float(line[0]), float(line[1]), middle, left, boot.size)
 
+
+def _fitted(first: Real, since: Real, apart: Real, spread: float) -> Real:
     def misfit(line: Real) -> Real:
         about = (line[0] + line[1] * since - apart) / spread
         return np.append(about, line[1] / _CRYSTAL)
 
-    line = least_squares(misfit, np.zeros(2), loss="huber", x_scale=(spread, _CRYSTAL)).x
-    left = _robust_sigma(apart - line[0] - line[1] * since)
-    return BootClock(reference * 1e-6 + float(line[0]), float(line[1]), middle, left, boot.size)
+    found = least_squares(misfit, first, loss="huber", x_scale=(spread, _CRYSTAL)).x
+    return np.asarray(found, dtype=np.float64)
 
 
 def _robust_sigma(values: Real) -> float:

@@ -6,6 +6,7 @@ needs is taken apart here; message payloads stay bytes until `mcap_log` decodes 
 
 from __future__ import annotations
 
+import contextlib
 import io
 import zlib
 from collections.abc import Callable, Iterator
@@ -81,21 +82,25 @@ class McapFile:
         """
         with self.path.open("rb") as file:
             loose = _Loose(str(self.path))
-            for offset, opcode, payload in self._records(file):
+            for offset, opcode, payload, in_data in self._records(file):
                 where = f"{self.path} byte {offset}"
-                if opcode == Opcode.CHUNK:
+                if not in_data:
+                    # Nothing rests on the summary: it adds the names of topics without messages.
+                    with contextlib.suppress(FormatError):
+                        self._register(opcode, payload, where)
+                elif opcode == Opcode.CHUNK:
                     yield from loose.flush()
                     yield self._unpacked(_parse(Chunk.read, payload, where), where)
                 elif opcode == Opcode.MESSAGE:
                     loose.add(_parse(partial(Message.read, length=len(payload)), payload, where))
                     if loose.size > _LOOSE_BYTES:
                         yield from loose.flush()
-                elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                else:
                     self._register(opcode, payload, where)
             yield from loose.flush()
 
-    def _records(self, file: BinaryIO) -> Iterator[tuple[int, int, bytes]]:
-        """Offset, opcode and content of each record of the data section."""
+    def _records(self, file: BinaryIO) -> Iterator[tuple[int, int, bytes, bool]]:
+        """Offset, opcode and content of each record, and whether it stands before the summary."""
         size = self.path.stat().st_size
         stream = ReadDataStream(cast(IO[bytes], _Exact(file, size)), calculate_crc=True)
         offset, in_data = 0, True
@@ -107,13 +112,12 @@ class McapFile:
                 payload = stream.read(length)
                 if opcode == Opcode.DATA_END:
                     self._check_data(_parse(DataEnd.read, payload, f"byte {offset}"), crc, offset)
-                    in_data = False  # what follows repeats and counts what came before
+                    in_data = False
                 if opcode == Opcode.FOOTER:
                     _parse(Footer.read, payload, f"{self.path} byte {offset}")
                     stream.read(_MAGIC_BYTES)
                     return
-                if in_data:
-                    yield offset, opcode, payload
+                yield offset, opcode, payload, in_data
         except EndOfFile:
             self.truncated = offset
 
@@ -131,7 +135,7 @@ class McapFile:
             schema = _parse(Schema.read, payload, where)
             if self.schemas.setdefault(schema.id, schema) != schema:
                 raise FormatError(f"schema {schema.id} is defined twice, differently", where=where)
-        else:
+        elif opcode == Opcode.CHANNEL:
             channel = _parse(Channel.read, payload, where)
             if self.channels.setdefault(channel.id, channel) != channel:
                 raise FormatError(
@@ -157,8 +161,7 @@ class McapFile:
             )
         channel, log_time, start, stop, other = walk_messages(values, messages, others)
         for at, opcode, length in other:
-            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self._register(opcode, data[at : at + length], where)
+            self._register(opcode, data[at : at + length], where)
         return Batch(values, channel, log_time, start, stop, where)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
+import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -95,7 +96,7 @@ def read_datasets(path: Path, names: Sequence[str] | None) -> list[Dataset]:
     try:
         with path.open("rb") as file, contextlib.redirect_stdout(said):
             log = ULog(file, None if names is None else list(names))
-    except (ULogException, ValueError, KeyError, IndexError, TypeError, OverflowError) as caught:
+    except (ULogException, LookupError, OSError, struct.error, TypeError, ValueError) as caught:
         raise FormatError(
             f"cannot be read as ULog ({type(caught).__name__}: {caught})",
             where=path,
