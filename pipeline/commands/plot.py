@@ -1,11 +1,11 @@
-"""Draw a level of a release: map with hillshade, uncertainty and flags beside it."""
+"""Draw a level of a release with its uncertainty and flags, or the artifact in a file."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-HELP = "draw a level of a release as PNG"
+HELP = "draw a level of a release, or a track, as PNG"
 NEEDS_PIPELINE = True
 
 TEMPORAL_KINDS = ("quiet-days", "residual", "autocorrelation", "sigma-tau")
@@ -14,7 +14,12 @@ _QUANTITIES = ("total", "north", "east", "down", "nn", "ne", "nd", "ee", "ed")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``magtiles plot``."""
-    parser.add_argument("release", type=Path, metavar="RELEASE", help="folder of a release")
+    parser.add_argument(
+        "release",
+        type=Path,
+        metavar="RELEASE",
+        help="folder of a release, or a file: a track's path, or its compensation",
+    )
     parser.add_argument(
         "--level", type=float, metavar="HEIGHT", help="height of a level, m (default: the lowest)"
     )
@@ -36,6 +41,12 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.temporal is not None:
         arguments.out.write_bytes(_temporal_picture(arguments.release, *arguments.temporal))
+        print(arguments.out)
+        return 0
+    if arguments.release.is_file():
+        from magtiles.pipeline.artifact_plots import artifact_figure
+
+        save_png(artifact_figure(arguments.release), arguments.out)
         print(arguments.out)
         return 0
     figure = release_figure(arguments.release, height=arguments.level, quantity=arguments.quantity)

@@ -1,0 +1,44 @@
+"""The picture of an artifact: which figure shows what a file of a contract holds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import xarray as xr
+
+from magtiles.pipeline.artifacts import open_artifact
+from magtiles.pipeline.compensation_plots import compensation_figure, track_figure
+from magtiles.schemas.errors import UsageError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def _draw_track(track: xr.Dataset) -> Figure:
+    return compensation_figure(track) if "field_total_raw" in track else track_figure(track)
+
+
+_FIGURES: dict[str, Callable[[xr.Dataset], Figure]] = {
+    "track": _draw_track,
+    "track-anomaly": track_figure,
+}
+"""Contract, without its version, to what draws it."""
+
+
+def artifact_figure(path: Path) -> Figure:
+    """Draw the artifact at `path` by its contract.
+
+    Raises UsageError for a contract that has no picture, FormatError for what is no artifact.
+    """
+    with open_artifact(path) as dataset:
+        contract = str(dataset.attrs.get("contract", "none"))
+        draw = _FIGURES.get(contract.split("/")[0])
+        if draw is None:
+            raise UsageError(
+                f"has contract '{contract}'",
+                where=path,
+                expected=f"a release's folder, or a file of {', '.join(_FIGURES)}",
+            )
+        return draw(dataset)
