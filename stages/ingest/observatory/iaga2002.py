@@ -143,6 +143,9 @@ def _bulk(content: bytes, begin: int, count: int) -> _Rows | None:
     time, values = np.empty(rows, np.int64), np.empty((count, rows))
     if parse_rows(text, begin, width, tail, time, values) >= 0:
         return None
+    # Whole numbers over 100 round to the double that parsing the text gives; compiled with
+    # reciprocals allowed, the division would not.
+    values /= 100.0
     time *= 1_000_000
     return values, time.view("datetime64[ns]"), None
 

@@ -1,8 +1,6 @@
 """Rows of IAGA-2002 in the format's columns, compiled to machine code.
 
-A year of one-minute rows is 37 MB of text, read here in one pass. A number is the whole number
-of its digits divided by 100: the same double that parsing its text gives, since both round one
-exact quotient.
+A year of one-minute rows is 37 MB of text, read here in one pass.
 """
 
 from __future__ import annotations
@@ -125,10 +123,10 @@ def parse_rows(
     time: NDArray[np.int64],
     values: NDArray[np.float64],
 ) -> int:
-    """Fill times (rows,), ms since 1970, and values (count, rows); the first bad row, or -1.
+    """Fill times (rows,), ms, and values (count, rows), hundredths; the first bad row, or -1.
 
-    Rows of `width` bytes stand from byte `begin` on; from the last value to column `tail` they
-    must be blank.
+    Times count from 1970. Rows of `width` bytes stand from byte `begin` on; from the last value
+    to column `tail` they must be blank.
     """
     count, rows = values.shape
     end = FIRST_VALUE + count * FIELD - 1
@@ -152,7 +150,7 @@ def parse_rows(
             field = row + FIRST_VALUE + k * FIELD
             hundredths = _hundredths(text, field)
             good = good and hundredths < _MALFORMED and _at(text, field - 1) == 32
-            values[k, i] = hundredths / 100.0
+            values[k, i] = hundredths
         if not good or (tail == width - 2 and _at(text, row + tail) != 13):
             return i
         time[i] = day * _MS_PER_DAY + clock
