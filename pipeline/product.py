@@ -205,26 +205,30 @@ def load_product(path: Path) -> Product:
     tables: ProductTables = parse_params(
         ProductTables, load_toml(path), where=path, error=SourceError
     )
-    if (tables.anomaly is None) == (tables.model is None):
-        both = "both [anomaly] and [model]" if tables.anomaly else "neither [anomaly] nor [model]"
-        raise SourceError(
-            f"there is {both}",
-            where=path,
-            expected="one: a survey's map, or a field model's",
-            remedy="make two products of it" if tables.anomaly else "add one",
-        )
+    made_from = _map(tables.anomaly, tables.model, path)
     temporal = None if tables.temporal is None else load_temporal(tables.temporal, path)
-    return Product(path, tables.product, _map(tables, path), temporal)
+    return Product(path, tables.product, made_from, temporal)
 
 
-def _map(tables: ProductTables, path: Path) -> SurveyMap | ModelMap:
-    if tables.model is not None:
-        return _model_map(tables.model, path)
-    assert tables.anomaly is not None
-    source_path = find_source(tables.anomaly.source, path, "anomaly.source")
+def _map(survey: AnomalyTable | None, model: ModelTable | None, path: Path) -> SurveyMap | ModelMap:
+    if model is not None and survey is None:
+        return _model_map(model, path)
+    if survey is not None and model is None:
+        return _survey_map(survey, path)
+    found = "is neither [anomaly] nor" if model is None else "are both [anomaly] and"
+    raise SourceError(
+        f"there {found} [model]",
+        where=path,
+        expected="one: a survey's map, or a field model's",
+        remedy="add one" if model is None else "make two products of it",
+    )
+
+
+def _survey_map(survey: AnomalyTable, path: Path) -> SurveyMap:
+    source_path = find_source(survey.source, path, "anomaly.source")
     source = load_source(source_path, ANOMALY_GRID)
-    _check_reference(tables.anomaly, source, path)
-    return SurveyMap(tables.anomaly, source_path, source)
+    _check_reference(survey, source, path)
+    return SurveyMap(survey, source_path, source)
 
 
 def _model_map(model: ModelTable, product: Path) -> ModelMap:

@@ -28,7 +28,8 @@ def plan_lattice(
     """The lattice of nodes at most `spacing_m` apart that covers `bounds`.
 
     Spacing is uniform in degrees, and such that `tile_deg` holds whole cells; tiles count from
-    the south-west corner. The outermost row never lies beyond 85 degrees. East-west cells are sized where the region is widest.
+    the south-west corner. The outermost row never lies beyond 85 degrees. East-west cells are
+    sized where the region is widest.
     Raises CoverageError beyond 85 degrees, where north and east turn too fast for a spline,
     ParameterError for a tile smaller than a few cells, for tiles that do not meet around the
     globe, and for too many nodes, naming the key of the product's `table`.
@@ -56,13 +57,8 @@ def plan_lattice(
             remedy="raise tile_deg or lower spacing_m",
         )
     step_lat, step_lon = tile_deg / cells[0], tile_deg / cells[1]
-    around = 360.0 / tile_deg
-    if east - west >= 360.0 and abs(around - round(around)) > 1e-9:
-        raise ParameterError(
-            f"tiles of {tile_deg:g} degrees do not divide the circle",
-            where=f"{table}.tile_deg",
-            expected="a divisor of 360 for a region all around",
-        )
+    if east - west >= 360.0:
+        _check_circle(tile_deg, table)
     nodes = (north - south) / step_lat * (east - west) / step_lon
     if nodes > _MOST_NODES:
         raise ParameterError(
@@ -85,6 +81,17 @@ def plan_lattice(
         tile_rows=cells[0],
         tile_columns=cells[1],
     )
+
+
+def _check_circle(tile_deg: float, table: str) -> None:
+    """Raise ParameterError where tiles all around the globe would not meet."""
+    around = 360.0 / tile_deg
+    if abs(around - round(around)) > 1e-9:
+        raise ParameterError(
+            f"tiles of {tile_deg:g} degrees do not divide the circle",
+            where=f"{table}.tile_deg",
+            expected="a divisor of 360 for a region all around",
+        )
 
 
 def _metres_per_degree(latitude: float, widest: float) -> tuple[float, float]:
