@@ -20,9 +20,9 @@ _YEARS = 5.0
 class WorldSpec:
     """What to synthesise.
 
-    The crust's power is `power_nt2` a degree at the reference radius, less what lies `depth_km` deep
-    loses: R_n = power (1 - depth / a)^(2n). 25 nT^2 and 6 km are like LCS-1's degrees 20 to 130. It
-    begins where the IGRF ends, with degree 14, so that no degree is missing.
+    The crust's power is `power_nt2` a degree at the reference radius, less what sources at
+    `depth_km` lose: R_n = power (1 - depth / a)^(2n). LCS-1 has 14 to 36 nT^2 at degrees 20 to
+    130. The crust begins where the IGRF ends, with degree 14, so that no degree is missing.
     """
 
     name: str = "world"
