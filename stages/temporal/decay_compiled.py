@@ -21,19 +21,40 @@ MOST_ROUNDS = 60
 
 
 @compiled
+def lagged_products(x: Floats, out: Floats) -> None:
+    """Sums of x_i x_(i+k) over i, out (rows, n), of each row of x (rows, n)."""
+    n = x.shape[1]
+    for row in range(x.shape[0]):
+        for k in range(n):
+            total = 0.0
+            for i in range(n - k):
+                total += x[row, i] * x[row, i + k]
+            out[row, k] = total
+
+
+@compiled
 def sums(u: float, weights: Floats, values: Floats) -> tuple[float, float, float]:
-    """A, S and the derivative with u of log(A^2 / S), of one row of lags."""
+    """A, S and the derivative with u of log(A^2 / S), of one row of lags.
+
+    Even and odd lags have powers of their own: neither then waits for the other's product.
+    """
     rate = math.exp(-u)
-    phi, power = math.exp(-rate), 1.0
+    even, odd, stride = 1.0, math.exp(-rate), math.exp(-2.0 * rate)
     across, d_across, square, d_square = 0.0, 0.0, 0.0, 0.0
-    for k in range(values.size):
-        weighted = weights[k] * power
-        term, form = weighted * values[k], weighted * power
-        across += term
-        d_across += k * term
-        square += form
-        d_square += k * form
-        power *= phi
+    for k in range(0, values.size - 1, 2):
+        one, other = weights[k] * even, weights[k + 1] * odd
+        across += one * values[k] + other * values[k + 1]
+        d_across += k * (one * values[k]) + (k + 1) * (other * values[k + 1])
+        square += one * even + other * odd
+        d_square += k * (one * even) + (k + 1) * (other * odd)
+        even *= stride
+        odd *= stride
+    if values.size % 2:
+        k = values.size - 1
+        across += weights[k] * even * values[k]
+        d_across += k * weights[k] * even * values[k]
+        square += weights[k] * even * even
+        d_square += k * weights[k] * even * even
     return across, square, 2.0 * rate * (d_across / across - d_square / square)
 
 
@@ -41,29 +62,33 @@ def sums(u: float, weights: Floats, values: Floats) -> tuple[float, float, float
 def fit_rows(nodes: Floats, powers: Floats, weights: Floats, values: Floats, out: Floats) -> None:
     """Sigma and tau, out (rows, 2), of each row of lags; weights, values (rows, lags).
 
-    `nodes` are values of u, powers (lags, nodes) the phi^k there. tau is 0 at the first node.
+    Weights are one or, where no two samples are so far apart, zero. `nodes` are values of u,
+    powers (lags, nodes) the phi^k there. tau is 0 at the first node.
     NaN where all values are zero or no two samples are there.
     """
+    whole = (powers * powers).sum(axis=0)
     for i in range(values.shape[0]):
         out[i] = math.nan
         if not (values[i, 0] > 0.0 and weights[i].sum() > 1.0):
             continue
-        best = highest(powers, weights[i], values[i])
+        best = highest(powers, whole, weights[i], values[i])
         u = refined(nodes, best, weights[i], values[i])
         across, square, _ = sums(u, weights[i], values[i])
         out[i, 0], out[i, 1] = math.sqrt(across / square), math.exp(u) if u > nodes[0] else 0.0
 
 
 @compiled
-def highest(powers: Floats, weights: Floats, values: Floats) -> int:
-    """The node where A > 0 and A^2 / S is greatest."""
-    across, square = np.zeros(powers.shape[1]), np.zeros(powers.shape[1])
+def highest(powers: Floats, whole: Floats, weights: Floats, values: Floats) -> int:
+    """The node where A > 0 and A^2 / S is greatest; `whole` is S (nodes,) of weights of one."""
+    across, square = np.zeros(whole.size), whole.copy()
     for k in range(values.size):
-        for j in range(powers.shape[1]):
+        for j in range(whole.size):
             across[j] += values[k] * powers[k, j]
-            square[j] += weights[k] * powers[k, j] * powers[k, j]
+        if weights[k] == 0.0:
+            for j in range(whole.size):
+                square[j] -= powers[k, j] * powers[k, j]
     best, explained = 0, 0.0
-    for j in range(powers.shape[1]):
+    for j in range(whole.size):
         if across[j] > 0.0 and across[j] * across[j] > explained * square[j]:
             best, explained = j, across[j] * across[j] / square[j]
     return best

@@ -20,6 +20,9 @@ SHORTEST_STEPS, LONGEST_SEGMENTS = 0.1, 1e8
 _BLOCK = 50_000
 """Samples taken at once by the autocorrelation, so that their lags stay in the cache."""
 
+_SHORT = 500
+"""Rows up to this long are multiplied out; longer ones are faster by Fourier transform."""
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -118,7 +121,13 @@ def _lagged_products(x: Floats) -> Floats:
     """Sums of x_i x_(i+k) over i, for k = 0 ... n - 1, of each row (row, n)."""
     from scipy import fft
 
+    from magtiles.stages.temporal import decay_compiled
+
     n = x.shape[1]
+    if n <= _SHORT:
+        products = np.empty(x.shape)
+        decay_compiled.lagged_products(x, products)
+        return products
     size = fft.next_fast_len(2 * n - 1, real=True)
     spectrum = fft.rfft(x, size, axis=1)
     power = spectrum.real**2 + spectrum.imag**2

@@ -239,16 +239,17 @@ def crossing(kind: int, packed: Floats, least: float, inside: float, outside: fl
 
 
 @compiled
-def beyond(u: float, packed: Floats, least: float, end: float) -> float:
-    """A u from which the profile exceeds its bound, away from its least at u; or `end`."""
-    step = 0.5 if end > u else -0.5
-    while True:
-        u += step
-        if (end - u) * step <= 0.0:
-            return end
-        if rise(PROFILE, u, packed, least) > CHI2_95:
-            return u
-        step *= 2.0
+def bound_of_tau(u: float, packed: Floats, least: float, end: float) -> float:
+    """The u between the profile's least at u and `end` where it has risen by 3.84, or `end`."""
+    inside, step = u, 1.0 if end > u else -1.0
+    while inside != end:
+        outside = inside + step
+        if (end - outside) * step <= 0.0:
+            outside = end
+        if rise(PROFILE, outside, packed, least) > CHI2_95:
+            return crossing(PROFILE, packed, least, inside, outside)
+        inside, step = outside, 2.0 * step
+    return end
 
 
 @compiled
@@ -279,9 +280,7 @@ def bounds(u: float, packed: Floats, span: tuple[float, float], out: Floats) -> 
     least = rise(PROFILE, u, packed, 0.0)
     for side in range(2):
         end = span[side]
-        at_tau = u
-        if u != end:
-            at_tau = crossing(PROFILE, packed, least, u, beyond(u, packed, least, end))
+        at_tau = bound_of_tau(u, packed, least, end)
         at_sigma = crossing(RIDGE, packed, least, u, at_tau) if at_tau != u else u
         out[1 + side] = math.sqrt(edge_s(at_sigma, packed, least + CHI2_95, side == 1))
         out[4 + side] = end_of(side) if at_tau == end else math.exp(at_tau)

@@ -110,9 +110,8 @@ def _between(middles: Times, curves: Floats) -> Floats:
 
 def _covered(months: Times, time: Times) -> NDArray[np.bool_]:
     """Which instants lie within the months from the first to the last."""
-    of_time = time.astype("datetime64[M]")
-    known = months.astype("datetime64[M]")
-    inside = (of_time >= known.min()) & (of_time <= known.max())
+    end = months[-1].astype("datetime64[M]") + 1
+    inside = (time >= months[0]) & (time < end.astype("datetime64[ns]"))
     if not inside.all():
         _LOG.warning(
             "%d of %d samples lie outside the months of the baseline and are left out",

@@ -8,7 +8,7 @@ import fogm as truth
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy import optimize, stats
+from scipy import optimize, signal, stats
 
 from magtiles.stages.temporal import fogm_compiled
 from magtiles.stages.temporal.fogm import (
@@ -164,6 +164,17 @@ def test_autocorrelation_is_the_sum_of_products() -> None:
             assert present[k] == (known.size > 0)
             expected = known.mean() * (180 - k) / 180 if known.size else 0.0
             assert values[k] == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize("samples", [500, 501, 10_800])
+def test_autocorrelation_of_long_segments(samples: int) -> None:
+    x = np.random.default_rng(2).standard_normal((2, samples))
+    x[1, 40:60] = np.nan
+    found, _ = autocorrelation(x)
+    assert found[0] == pytest.approx(signal.correlate(x[0], x[0])[samples - 1 :] / samples)
+    pairs = np.isfinite(x[1, 7:] * x[1, :-7])
+    mean = (x[1, 7:] * x[1, :-7])[pairs].mean()
+    assert found[1, 7] == pytest.approx(mean * (samples - 7) / samples, abs=1e-9)
 
 
 def test_fit_to_the_autocorrelation_is_scipys() -> None:
