@@ -141,9 +141,10 @@ def autocorrelation_figure(series: xr.Dataset, curves: xr.Dataset, fits: xr.Data
         unit.plot(lags, values[row] / values[row, 0], color=colour, lw=0.4, alpha=0.25)
     _draw_class_fits(plain, fits, lags)
     _draw_envelope(unit, fits, lags)
-    largest = float(np.percentile(values[known, 0], 90))
-    plain.set_ylim(-0.4 * largest, 1.6 * largest)
-    plain.set_title("about zero; one segment in ten is larger", fontsize=10, loc="left")
+    typical = float(np.median(values[known, 0])) if known.size else 1.0
+    plain.set_yscale("symlog", linthresh=typical)
+    plain.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    plain.set_title("about zero", fontsize=10, loc="left")
     unit.set_ylim(-1.0, 1.05)
     unit.set_title("divided by each one's own variance", fontsize=10, loc="left")
     plain.set_ylabel("nT\N{SUPERSCRIPT TWO}")

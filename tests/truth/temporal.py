@@ -16,8 +16,8 @@ MINUTE = np.arange(1440.0)
 # Code, latitude, longitude, dip latitude, and the amplitude of each element's curve.
 Station = tuple[str, float, float, float, tuple[float, float, float, float]]
 
-MIDDLE: Station = ("MID", 44.0, 10.0, 43.0, (-20.0, 15.0, 10.0, 3.0))
-SOUTH: Station = ("SOU", 20.0, 12.0, 13.0, (60.0, 5.0, -8.0, 40.0))
+MIDDLE: Station = ("MID", 44.0, 10.0, 41.2, (-20.0, 15.0, 10.0, 3.0))
+SOUTH: Station = ("SOU", 20.0, 12.0, 11.3, (60.0, 5.0, -8.0, 40.0))
 
 
 def bump(minute: Any) -> Any:
