@@ -26,6 +26,7 @@ from magtiles.pipeline.sample import DEMO, synthesize, write_survey
 from magtiles.schemas import contracts
 from magtiles.stages.declare import Params, parse_params
 from magtiles.stages.ingest.field_model import FIELD_MODEL, CoefficientsParams
+from magtiles.stages.ingest.log.source import TRACK, Columns, IngestLogParams
 from magtiles.stages.ingest.source import (
     ANOMALY_GRID,
     IngestGridParams,
@@ -42,10 +43,12 @@ TABLES = {
     "[product]": ProductTable,
     "[anomaly]": AnomalyTable,
     "[coefficients]": CoefficientsParams,
+    "[log]": IngestLogParams,
+    "[log.columns]": Columns,
     "[model]": ModelTable,
     "region": RegionTable,
 }
-KINDS: dict[str, SourceKind[Any]] = {kind.name: kind for kind in (ANOMALY_GRID, FIELD_MODEL)}
+KINDS: dict[str, SourceKind[Any]] = {kind.name: kind for kind in (ANOMALY_GRID, FIELD_MODEL, TRACK)}
 
 
 def blocks(language: str) -> list[object]:

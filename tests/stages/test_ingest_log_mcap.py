@@ -479,6 +479,17 @@ def test_a_truncated_log_keeps_its_whole_chunks(
         assert f"{messages} messages, recorded until 2023-11-14T22:13:2" in kept[0].getMessage()
 
 
+def test_the_zeros_that_a_crash_leaves_behind_are_where_the_log_ends(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    whole = drive().finish()
+    _, end = first_chunk(whole)
+    path = tmp_path / "log.mcap"
+    path.write_bytes(whole[:end] + bytes(5000))
+    assert 0 < ingest(path).sizes["time"] < 200
+    assert f"truncated after byte {end}" in caplog.text
+
+
 def flipped(data: bytes, at: int) -> bytes:
     return data[:at] + bytes([data[at] ^ 0x10]) + data[at + 1 :]
 

@@ -28,6 +28,7 @@ from magtiles.schemas.errors import FormatError
 from magtiles.stages.ingest.log.mcap_walk import count_records, walk_messages
 
 _MAGIC_BYTES = 8
+_FILLED = 0  # no opcode: space that a crash left unwritten
 _MESSAGE_HEADER_BYTES = 22  # channel, sequence, log time, publish time
 _ALWAYS_BYTES = 64 << 20
 _EXPANSION = 100
@@ -109,6 +110,8 @@ class McapFile:
             while True:
                 offset, crc = stream.count, stream.checksum()
                 opcode, length = stream.read1(), stream.read8()
+                if opcode == _FILLED:
+                    raise EndOfFile
                 payload = stream.read(length)
                 if opcode == Opcode.DATA_END:
                     self._check_data(_parse(DataEnd.read, payload, f"byte {offset}"), crc, offset)
