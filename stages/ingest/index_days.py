@@ -47,7 +47,7 @@ def read_day_list(text: str, where: str) -> list[Values]:
                 expected="a month, ten quiet days and five disturbed ones",
                 remedy="fetch the file again",
             )
-        first = date_of(match[2], _MONTHS.index(match[1]) + 1, 1, place)
+        first = date_of((match[2], _MONTHS.index(match[1]) + 1, 1), place)
         if first in months:
             raise FormatError(f"{row.strip()[:8]} is given twice", where=place)
         months[first] = _ranks(first, days, place)

@@ -38,7 +38,7 @@ def read_dst_wdc(text: str, where: str) -> list[Values]:
             raise FormatError(
                 f"the line is malformed: {caught}", where=place, expected="whole numbers"
             ) from None
-        date = date_of(century * 100 + int(row[3:5]), row[5:7], row[8:10], place)
+        date = date_of((century * 100 + int(row[3:5]), row[5:7], row[8:10]), place)
         stored[stored == _MISSING] = np.nan
         rows.append((date, list(base * 100.0 + stored), line))
     return [gather("dst", 1, rows, where)]

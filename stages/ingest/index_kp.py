@@ -40,7 +40,7 @@ def read_kp_intervals(text: str, where: str) -> list[Values]:
         hour = number(words[3], place)
         if hour % 3 != 0 or not 0 <= hour < 24:
             raise FormatError(f"hour {words[3]}", where=place, expected="0, 3, ... 21")
-        day = np.datetime64(date_of(*words[:3], place), "h")
+        day = np.datetime64(date_of(words[:3], place)).astype("datetime64[h]")
         times.append(day + np.timedelta64(int(hour), "h"))
         kp.append(thirds(number(words[7], place), place))
         ap.append(_missing_below_zero(number(words[8], place)))
@@ -68,7 +68,7 @@ def read_kp_days(text: str, where: str) -> list[Values]:
     for line, row in numbered(text):
         place = f"{where} line {line}"
         words = _words(row, 28, place)
-        date = date_of(*words[:3], place)
+        date = date_of(words[:3], place)
         kp.append((date, [thirds(number(w, place), place) for w in words[7:15]], line))
         ap.append((date, [_missing_below_zero(number(w, place)) for w in words[15:23]], line))
     return [gather("kp", 3, kp, where), gather("ap", 3, ap, where)]
@@ -87,7 +87,7 @@ def read_kp_csv(text: str, where: str) -> list[Values]:
         words = row.split(",")
         if len(words) < 9 or re.fullmatch(r"\d{4}-\d\d-\d\d", words[0]) is None:
             raise FormatError(f"found '{row}'", where=place, expected="a date and eight Kp")
-        date = date_of(*words[0].split("-"), place)
+        date = date_of(words[0].split("-"), place)
         kp = [thirds(number(w, place), place) if w.strip() else np.nan for w in words[1:9]]
         rows.append((date, kp, line))
     return [gather("kp", 3, rows, where)]
@@ -110,7 +110,7 @@ def read_kp_wdc(text: str, where: str) -> list[Values]:
                 expected="date, rotation, eight Kp, their sum and eight ap in 55 columns or more",
                 remedy="fetch the file again",
             )
-        date = date_of(_year(row, place), row[2:4], row[4:6], place)
+        date = date_of((_year(row, place), row[2:4], row[4:6]), place)
         kp.append((date, [_tenths(row[i : i + 2], place) for i in range(12, 28, 2)], line))
         ap.append((date, [_blank_or(row[i : i + 3], place) for i in range(31, 55, 3)], line))
     return [gather("kp", 3, kp, where), gather("ap", 3, ap, where)]

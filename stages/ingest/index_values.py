@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,7 +53,7 @@ def gather(
     rows = sorted(rows, key=lambda row: row[0])
     starts = np.array([row[0] for row in rows], "datetime64[h]")
     within = np.arange(0, 24, hours) * np.timedelta64(1, "h")
-    time = (starts[:, None] + within).ravel()
+    time = np.asarray((starts[:, None] + within).ravel(), "datetime64[h]")
     return Values(name, hours, time, np.array([row[1] for row in rows], np.float64).ravel(), where)
 
 
@@ -79,8 +80,9 @@ def number(word: str, where: str) -> float:
     return value
 
 
-def date_of(year: int | str, month: int | str, day: int | str, where: str) -> datetime.date:
-    """A date. Raises FormatError naming the line."""
+def date_of(words: Sequence[int | str], where: str) -> datetime.date:
+    """A date of year, month and day. Raises FormatError naming the line."""
+    year, month, day = words
     try:
         return datetime.date(int(year), int(month), int(day))
     except ValueError:

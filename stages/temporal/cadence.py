@@ -8,7 +8,7 @@ given where at least 90 % of its input, by weight, is there (INTERMAGNET Technic
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import xarray as xr
@@ -66,7 +66,8 @@ def gaussian_filter(kind: MinuteFilter = "intermagnet") -> Real:
     92 points (SciPy's `get_window` makes periodic windows), centred half a second later.
     """
     weights: Real = windows.gaussian(_TAPS, _GAUSSIAN_S, sym=kind == "intermagnet")
-    return weights / weights.sum()
+    weights /= weights.sum()
+    return weights
 
 
 def weighted_means(values: Real, weights: Real, begin: NDArray[np.int64]) -> tuple[Real, Real]:
@@ -137,7 +138,7 @@ def _flags(flags: Flags, begin: NDArray[np.int64], taps: int) -> Flags:
 def _rebuilt(
     series: xr.Dataset, time: NDArray[np.datetime64], data: dict[str, Real], flags: Flags
 ) -> xr.Dataset:
-    variables = {k: ("time", v, series[k].attrs) for k, v in data.items()}
+    variables: dict[str, Any] = {k: ("time", v, series[k].attrs) for k, v in data.items()}
     variables["quality_flag"] = ("time", flags, series["quality_flag"].attrs)
     return xr.Dataset(
         variables, coords={"time": ("time", time, series["time"].attrs)}, attrs=series.attrs

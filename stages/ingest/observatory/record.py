@@ -99,7 +99,8 @@ def check_times(time: Times, where: str, lines: NDArray[np.int64]) -> float | No
     line, where time stands still or goes backwards and where the spacing changes. A gap is a
     multiple of the usual spacing.
     """
-    steps = np.diff(time.astype("datetime64[ns]").view(np.int64))
+    ticks: NDArray[np.int64] = time.astype("datetime64[ns]").view(np.int64)
+    steps = ticks[1:] - ticks[:-1]
     if not steps.size:
         return None
     if steps[0] > 0 and (steps == steps[0]).all():

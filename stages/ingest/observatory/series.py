@@ -159,7 +159,8 @@ def _grid(records: Sequence[Record], cadence: float) -> Times:
             expected=f"at most {_MOST_SAMPLES}",
             remedy="ingest records that lie far apart one by one",
         )
-    return begin + np.arange(count) * step
+    time: Times = begin + np.arange(count) * step
+    return time
 
 
 def _place(record: Record, time: Times, cadence: float) -> slice | NDArray[np.int64]:
