@@ -29,6 +29,31 @@ Floats = NDArray[np.float64]
 
 _GRAVITY = 9.80665  # m s-2, standard
 
+_SOURCE_TOML = """\
+# A synthetic aircraft: scalar and vector magnetometer, in body axes forward, right, down.
+[source]
+id = "{stem}"
+kind = "track"
+files = ["{stem}.csv"]
+licence = "CC0-1.0"
+title = "Synthetic flight with exact truth beside it"
+
+[log]
+units = "nT"
+height_reference = "ellipsoid"
+sensor_to_body = "forward,right,down"
+
+[log.columns]
+time = "time_utc"
+field_total = "mag_total_nt"
+field_x = "flux_x_nt"
+field_y = "flux_y_nt"
+field_z = "flux_z_nt"
+latitude = "latitude_deg"
+longitude = "longitude_deg"
+height = "height_m"
+"""
+
 
 @dataclass(frozen=True)
 class Aircraft:
@@ -120,19 +145,24 @@ def fly(sample: Sample, aircraft: Aircraft = AIRCRAFT) -> Flight:
 def write_flight(folder: Path, sample: Sample, aircraft: Aircraft = AIRCRAFT) -> list[Path]:
     """Write the flight over a sample as track/1 and as CSV, and the truth; the same bytes always.
 
-    Returns ``<name>-flight.nc``, ``<name>-flight.csv`` and ``<name>-flight-truth.nc``. The CSV has
-    a line of column names with units; attitude is w, x, y, z.
+    Returns ``<name>-flight.nc``, ``<name>-flight.csv``, the CSV's source TOML and
+    ``<name>-flight-truth.nc``. The CSV has a line of column names with units; attitude is
+    w, x, y, z.
     """
     flight = fly(sample, aircraft)
     stem = f"{sample.spec.name}-flight"
-    track, table, truth = (folder / f"{stem}{end}" for end in (".nc", ".csv", "-truth.nc"))
+    track, table, toml, truth = (
+        folder / f"{stem}{end}" for end in (".nc", ".csv", ".toml", "-truth.nc")
+    )
     write_artifact(flight.track, track, "track/1")
     with atomic_path(table) as temporary:
         _write_csv(flight.track, temporary)
+    with atomic_path(toml) as temporary:
+        temporary.write_text(_SOURCE_TOML.format(stem=stem), encoding="ascii")
     encoding: dict[Any, Any] = {name: {"_FillValue": None} for name in flight.truth.data_vars}
     with atomic_path(truth) as temporary:
         flight.truth.to_netcdf(temporary, engine="netcdf4", format="NETCDF4", encoding=encoding)
-    return [track, table, truth]
+    return [track, table, toml, truth]
 
 
 def _write_csv(track: xr.Dataset, path: Path) -> None:
@@ -146,7 +176,8 @@ def _write_csv(track: xr.Dataset, path: Path) -> None:
         "speed_m_s": ("speed", "%.2f"),
         "line": ("line", "%d"),
     }
-    columns: dict[str, Any] = {"time_utc": np.datetime_as_string(track["time"].values, unit="ms")}
+    utc = np.datetime_as_string(track["time"].values, unit="ms", timezone="UTC")
+    columns: dict[str, Any] = {"time_utc": utc}
     for title, (name, form) in numbers.items():
         values = track[name].values.reshape(track.sizes["time"], -1)
         parts = "xyz" if values.shape[1] == 3 else "wxyz"

@@ -24,6 +24,8 @@ from magtiles.pipeline.sample_aircraft import (
 from magtiles.pipeline.synthetic import DEMO, Sample, synthesize
 from magtiles.schemas import contracts
 from magtiles.schemas.errors import ContractError, CoverageError
+from magtiles.stages.ingest.log.source import TRACK
+from magtiles.stages.ingest.source import load_source
 from magtiles.stages.vehicle.tolles_lawson.apply import ApplyTollesLawsonParams, apply_tolles_lawson
 from magtiles.stages.vehicle.tolles_lawson.fit import FitTollesLawsonParams, fit_tolles_lawson
 from magtiles.stages.vehicle.tolles_lawson.terms import term_columns, term_names
@@ -99,7 +101,7 @@ def test_the_aircraft_flies_as_planned(flight: Flight):
 def test_files_hold_the_flight(sample: Sample, flight: Flight, tmp_path: Path):
     paths = write_flight(tmp_path, sample)
     assert [path.name for path in paths] == [
-        "demo-flight.nc", "demo-flight.csv", "demo-flight-truth.nc",
+        "demo-flight.nc", "demo-flight.csv", "demo-flight.toml", "demo-flight-truth.nc",
     ]  # fmt: skip
     assert sum(path.stat().st_size for path in paths) < 6e6
     with open_artifact(paths[0]) as track:
@@ -111,7 +113,12 @@ def test_files_hold_the_flight(sample: Sample, flight: Flight, tmp_path: Path):
     np.testing.assert_allclose(table[:, 3], flight.track["field_total"], atol=5.1e-4)
     np.testing.assert_allclose(table[:, 4:7], flight.track["field_body"], atol=0.051)
     np.testing.assert_allclose(table[:, 7:11], flight.track["attitude"], atol=5.1e-7)
-    with xr.open_dataset(paths[2], engine="netcdf4") as truth:
+    log = load_source(paths[2], TRACK)
+    assert log.files == (paths[1],)
+    named = log.params.columns
+    assert named is not None
+    assert set(named.model_dump().values()) == {names[0], *names[1:8]}
+    with xr.open_dataset(paths[3], engine="netcdf4") as truth:
         found = dict(zip(truth["term"].values, truth["coefficient"].values, strict=True))
     assert found == coefficients(AIRCRAFT)
     assert found["induced_xy"] == pytest.approx(2.0 * AIRCRAFT.induced[0][1])
@@ -189,7 +196,7 @@ def test_high_above_the_sources_a_map_adds_little(flight: Flight):
 
 
 def test_stages_run_on_the_sample_s_files(sample: Sample, tmp_path: Path, capsys: Any):
-    track, _, _ = write_flight(tmp_path, sample)
+    track = write_flight(tmp_path, sample)[0]
     calibration, out = tmp_path / "calibration.nc", tmp_path / "compensated.nc"
     fitted = ["run", "fit-tolles-lawson", "--in", f"track={track}", "--out", str(calibration)]
     assert main([*fitted, "--param", "induced_terms=6"]) == 0
