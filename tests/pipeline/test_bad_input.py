@@ -253,11 +253,11 @@ _FILES = [
     Expect(
         survey(b"<!DOCTYPE html><p>404"),
         1,
-        ["small-survey.tif byte 0", "an HTML page", "expected GeoTIFF, GXF or netCDF"],
+        ["small-survey.tif byte 0", "an HTML page", "expected GeoTIFF, GXF, netCDF"],
         "html",
     ),
     Expect(survey(b"12 34\n"), 1, ["small-survey.tif byte 0", "text of an unknown kind"], "text"),
-    Expect(survey(b"PK\x03\x04"), 1, ["a zip archive", "unpack or convert it first"], "zip"),
+    Expect(survey(b"PK\x03\x04"), 1, ["not a whole zip file", "fetch it again"], "zip"),
     Expect(raster(crs=None), 1, ["small-survey.toml [grid]", "'crs'", "add crs = "], "no-crs"),
     Expect(raster(transform=None), 1, ["small-survey.tif", "no position"], "no-position"),
     Expect(uneven, 1, ["uneven.nc axis x", "index 19 to 20", "1300"], "irregular"),
