@@ -18,7 +18,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "release",
         type=Path,
         metavar="RELEASE",
-        help="folder of a release, or a file: a track's path, or its compensation",
+        help="folder of a release, or a file: a track's path, or its compensation; a calibration",
+    )
+    parser.add_argument(
+        "--track", type=Path, metavar="FILE", help="the track that a calibration was made from"
     )
     parser.add_argument(
         "--level", type=float, metavar="HEIGHT", help="height of a level, m (default: the lowest)"
@@ -46,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.release.is_file():
         from magtiles.pipeline.artifact_plots import artifact_figure
 
-        save_png(artifact_figure(arguments.release), arguments.out)
+        save_png(artifact_figure(arguments.release, arguments.track), arguments.out)
         print(arguments.out)
         return 0
     figure = release_figure(arguments.release, height=arguments.level, quantity=arguments.quantity)

@@ -9,6 +9,8 @@ Real = NDArray[np.float64]
 
 _STEPS = 240
 """Steps in time, in the slowest revolution, at which turning is looked at."""
+_STRAIGHT = 0.05 * 2.0 * np.pi
+"""Turn, radians, below which the ends of a stretch are no part of its circles."""
 
 
 def tangent_angle(points: Real, step: float) -> Real:
@@ -65,8 +67,17 @@ def find_circles(seconds: Real, angle: Real, slowest_s: float) -> tuple[slice, f
         (np.abs(np.diff(turned[a : b + 1])).sum() / (2.0 * np.pi), a, b) for a, b in stretches
     ]
     most, first, last = max(driven)
+    first, last = _without_straight_ends(turned, first, last)
     start, stop = np.searchsorted(seconds, [clock[first], clock[last]], side="left")
     return slice(int(start), int(stop) + 1), float(most)
+
+
+def _without_straight_ends(turned: Real, first: int, last: int) -> tuple[int, int]:
+    """The stretch less what is nearly straight before and after its circles."""
+    part = turned[first : last + 1]
+    from_first = np.abs(part - part[0]) >= _STRAIGHT
+    from_last = np.abs(part - part[-1])[::-1] >= _STRAIGHT
+    return first + int(np.argmax(from_first)) - 1, last - int(np.argmax(from_last)) + 1
 
 
 def _in_tight_revolutions(turned: Real) -> NDArray[np.bool_]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,6 +20,9 @@ from magtiles.stages.vehicle.calibration.surface import (
     fit_surface,
     matrix_and_covariance,
 )
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 Real = NDArray[np.float64]
 
@@ -108,10 +113,18 @@ def from_attitude(raw: Real, core: Real, attitude: Real, *, outlier_sigma: float
 
 def body_core(core: Real, attitude: Real) -> Real:
     """The core field (n, 3) in body axes."""
+    return np.asarray(_rotation(attitude).inv().apply(core))
+
+
+def to_ned(body: Real, attitude: Real) -> Real:
+    """Vectors (n, 3) of body axes in north, east, down."""
+    return np.asarray(_rotation(attitude).apply(body))
+
+
+def _rotation(attitude: Real) -> Rotation:
     from scipy.spatial.transform import Rotation
 
-    rotation = Rotation.from_quat(attitude, scalar_first=True)
-    return np.asarray(rotation.inv().apply(core))
+    return Rotation.from_quat(attitude, scalar_first=True)
 
 
 def _trimmed(design: Real, raw: Real, outlier_sigma: float) -> tuple[NDArray[np.bool_], Real, Real]:
