@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magtiles.catalog.releases.fields import parse_json
+from magtiles.catalog.releases.fields import Fields, parse_json
 from magtiles.catalog.releases.manifest import Manifest
 from magtiles.catalog.releases.reader import Release
 from magtiles.schemas.errors import IntegrityError
+from magtiles.stages.release.checks_temporal import (
+    UNITS,
+    temporal_answers,
+    temporal_positions,
+)
+
+Arrays = dict[str, NDArray[Any]]
 
 CHECKS_NAME = "checks.json"
 FORMAT = "release-checks/1.0.0"
@@ -45,13 +52,21 @@ def make_checks(release: Release) -> dict[str, Any]:
     elif release.manifest.has_reference_surface:
         height = height + release.anomaly.reference_surface(latitude, longitude)
     positions = {"latitude": latitude, "longitude": longitude, height_name: height}
-    return {
+    document: dict[str, Any] = {
         "format": FORMAT,
         "tolerance": TOLERANCE,
         "units": _UNITS,
         "positions": {name: values.tolist() for name, values in positions.items()},
         "expected": {name: _plain(v) for name, v in _answers(release, positions).items()},
     }
+    if release.manifest.temporal is not None:
+        at = temporal_positions(release)
+        document["temporal"] = {
+            "units": UNITS,
+            "positions": {name: _plain(values) for name, values in at.items()},
+            "expected": {name: _plain(v) for name, v in temporal_answers(release, at).items()},
+        }
+    return document
 
 
 def replay_checks(release: Release) -> float:
@@ -61,9 +76,19 @@ def replay_checks(release: Release) -> float:
     """
     where = release.path / CHECKS_NAME
     document = parse_json(release.file(CHECKS_NAME), where)
-    positions = _arrays(document.inner("positions").plain(), where)
-    expected = _arrays(document.inner("expected").plain(), where)
-    answers = _answers(release, positions)
+    worst = _replay(document, lambda at: _answers(release, at), where)
+    if release.manifest.temporal is not None:
+        temporal = document.inner("temporal")
+        worst = max(worst, _replay(temporal, lambda at: temporal_answers(release, at), where))
+    return worst
+
+
+def _replay(
+    section: Fields, ask: Callable[[Mapping[str, NDArray[Any]]], Arrays], where: object
+) -> float:
+    """The largest error of the answers to one section of checks."""
+    answers = ask(_arrays(section.inner("positions").plain(), where))
+    expected = _arrays(section.inner("expected").plain(), where)
     worst = 0.0
     for name, wanted in expected.items():
         if name not in answers or answers[name].shape != wanted.shape:
