@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import shockley
@@ -204,3 +206,17 @@ def test_a_tenth_of_a_circle_is_refused(method) -> None:
     raw, _, _ = readings(circles(0.1), noise=200.0)
     with pytest.raises(CoverageError, match=r"not observed.*core field is 53244 nT"):
         method(raw, CORE, outlier_sigma=SIGMA)
+
+
+def test_the_result_page_has_these_numbers(monte_carlo, request: pytest.FixtureRequest) -> None:
+    """docs/calibration.md: his tables, and the column of ours that is run here in full."""
+    page = (Path(__file__).resolve().parents[2] / "docs/calibration.md").read_text("utf-8")
+    assert shockley.his_table() in page
+    if "triangular" not in request.node.name:
+        return
+    ours = shockley.table({"modified ellipsoid": monte_carlo["larger"]["modified ellipsoid"]})
+    section = page[page.index("Biases of 300 to 600 mG") :]
+    for line in ours.splitlines()[2:]:
+        name, value = (cell.strip() for cell in line.strip("|").split("|"))
+        row = next(r for r in section.splitlines() if r.startswith(f"| {name} |"))
+        assert row.split("|")[4].strip() == value

@@ -153,11 +153,11 @@ def monte_carlo(
 
 
 def _cell(value: tuple[float, float] | None) -> str:
-    return "" if value is None else f"{value[0]:.4f} +- {value[1]:.4f}"
+    return "" if value is None else f"{value[0]:.4f} ± {value[1]:.4f}"
 
 
 def his_table() -> str:
-    """Tables 3.1 and 3.2 as one: mean +- standard deviation."""
+    """Tables 3.1 and 3.2 as one: mean and standard deviation."""
     lines = ["| error | swinging | strict ellipse | modified ellipsoid |", "|---|---|---|---|"]
     lines += [f"| {name} | {' | '.join(map(_cell, row))} |" for name, row in HIS.items()]
     return "\n".join(lines)
