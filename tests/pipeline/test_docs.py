@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from magtiles.catalog.flags import QualityFlag
+from magtiles.catalog.releases.temporal_table import TEMPORAL_VARIABLES
 from magtiles.catalog.releases.tile_table import TILE_VARIABLES
 from magtiles.pipeline import main as command_line
 from magtiles.pipeline.main import main
@@ -23,10 +24,13 @@ from magtiles.pipeline.product import (
     RegionTable,
 )
 from magtiles.pipeline.sample import DEMO, synthesize, write_survey
+from magtiles.pipeline.synthetic_observatories import TemporalSample
+from magtiles.pipeline.temporal_part import TemporalTable
 from magtiles.schemas import contracts
 from magtiles.stages.declare import Params, parse_params
 from magtiles.stages.ingest.field_model import FIELD_MODEL, CoefficientsParams
 from magtiles.stages.ingest.log.source import TRACK, Columns, IngestLogParams
+from magtiles.stages.ingest.observatory.stage import OBSERVATORY_SERIES, IngestObservatoryParams
 from magtiles.stages.ingest.source import (
     ANOMALY_GRID,
     IngestGridParams,
@@ -43,12 +47,16 @@ TABLES = {
     "[product]": ProductTable,
     "[anomaly]": AnomalyTable,
     "[coefficients]": CoefficientsParams,
+    "[series]": IngestObservatoryParams,
     "[log]": IngestLogParams,
     "[log.columns]": Columns,
     "[model]": ModelTable,
+    "[temporal]": TemporalTable,
     "region": RegionTable,
 }
-KINDS: dict[str, SourceKind[Any]] = {kind.name: kind for kind in (ANOMALY_GRID, FIELD_MODEL, TRACK)}
+KINDS: dict[str, SourceKind[Any]] = {
+    kind.name: kind for kind in (ANOMALY_GRID, FIELD_MODEL, OBSERVATORY_SERIES, TRACK)
+}
 
 
 def blocks(language: str) -> list[object]:
@@ -65,7 +73,7 @@ def beside_the_demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder that holds a small stand-in for what `make` builds."""
     folder = tmp_path_factory.mktemp("checkout")
     spec = replace(DEMO, width_m=50e3, length_m=40e3, dipoles=60)
-    write_survey(folder / "build/sample", synthesize(spec))
+    write_survey(folder / "build/sample", synthesize(spec), TemporalSample())
     product, store, work = (
         str(folder / f"build/{n}") for n in ("sample/demo.toml", "releases", "w")
     )
@@ -138,6 +146,11 @@ def test_format_names_every_variable_flag_and_contract() -> None:
         assert rule.dtype in row
         assert (rule.units or "-") in row
         assert ("(" + ", ".join(rule.dims) + ")" if rule.dims else "scalar") in row
+    for name, stored in TEMPORAL_VARIABLES.items():
+        kinds = " or ".join("text" if d == "str" else d for d in stored.dtypes)
+        dims = ", ".join(stored.dims)
+        row = f"| `{name}` | ({dims}) | {kinds} | {stored.units or '-'} | {stored.long_name} |"
+        assert row in page
     for flag in QualityFlag:
         assert f"| {flag.value} | `{str(flag.name).lower()}` |" in page
     for name, versions in contracts.available().items():
