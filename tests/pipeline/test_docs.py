@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from magtiles.catalog.flags import QualityFlag
+from magtiles.catalog.flags import QualityFlag, RecordFlag
 from magtiles.catalog.releases.temporal_table import TEMPORAL_VARIABLES
 from magtiles.catalog.releases.tile_table import TILE_VARIABLES
 from magtiles.pipeline import main as command_line
@@ -155,6 +155,12 @@ def test_format_names_every_variable_flag_and_contract() -> None:
         assert f"| {flag.value} | `{str(flag.name).lower()}` |" in page
     for name, versions in contracts.available().items():
         assert f"`{name}/{versions[-1]}`" in page
+
+
+def test_observatories_names_every_flag_of_a_record() -> None:
+    page = (ROOT / "docs/observatories.md").read_text("utf-8")
+    for flag in RecordFlag:
+        assert f"| {flag.value} `{str(flag.name).lower()}` |" in page
 
 
 def test_make_help_and_readme_agree() -> None:

@@ -10,7 +10,9 @@ import pytest
 import xarray as xr
 
 from magtiles.schemas import contracts
-from magtiles.stages.ingest.index import IngestIndexParams, ingest_index
+from magtiles.stages.ingest.index import ACTIVITY_INDEX, IngestIndexParams, ingest_index
+from magtiles.stages.ingest.observatory.stage import OBSERVATORY_SERIES
+from magtiles.stages.ingest.source import load_source
 
 KP = np.array([[10, 12, 27, 0, 1, 2, 3, 26], [0, 0, 1, 1, 2, 2, 3, 3]])  # thirds, two days
 AP_OF_THIRDS = np.array(
@@ -120,6 +122,24 @@ def test_lists_give_ranks_to_all_intervals_of_a_day(tmp_path: Path) -> None:
     assert [int(rank[d - 1]) for d in (13, 5, 24, 2, 4, 1, 14, 3)] == [1, 2, 3, 4, 5, 6, 10, 0]
     assert [int(worst[d - 1]) for d in (27, 15, 28, 26, 16, 13)] == [1, 2, 3, 4, 5, 0]
     assert [int(mark[d - 1]) for d in (13, 4, 2, 17, 15, 27)] == [0, 1, 2, 2, 3, 0]
+
+
+SOURCES = Path(__file__).resolve().parents[2] / "catalog/sources"
+
+
+def test_sources_of_the_catalogue_are_valid() -> None:
+    assert load_source(SOURCES / "gfz_kp.toml", ACTIVITY_INDEX).files[0].name.startswith("Kp_ap")
+    assert len(load_source(SOURCES / "gfz_quiet_days.toml", ACTIVITY_INDEX).files) == 11
+    boulder = load_source(SOURCES / "intermagnet_bou.toml", OBSERVATORY_SERIES)
+    assert boulder.params.iaga_code == "BOU"
+
+
+def test_a_source_names_the_files_and_itself(tmp_path: Path, real_data: Path) -> None:
+    toml = tmp_path / "gfz_quiet_days.toml"
+    toml.write_text((SOURCES / toml.name).read_text())
+    index = checked([toml, *sorted((real_data / "indices/gfz_quiet_days").iterdir())])
+    assert index.attrs["source"] == "gfz-quiet-days"
+    assert index.sizes["time"] == 8 * 33603  # days of 1932 to 2023
 
 
 def test_the_two_real_kp_files_agree_exactly(real_data: Path) -> None:
