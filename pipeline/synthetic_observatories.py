@@ -252,8 +252,16 @@ def truth_dataset(sample: TemporalSample) -> xr.Dataset:
                 np.stack([sample.station(i).level for i in range(len(stations))]),
                 {"units": "nT"},
             ),
-            "sigma": (of_class, np.moveaxis([s.sigma_nt for s in stations], 1, 2), {"units": "nT"}),
-            "tau": (of_class, np.moveaxis([s.tau_s for s in stations], 1, 2), {"units": "s"}),
+            "sigma": (
+                of_class,
+                np.moveaxis(np.array([s.sigma_nt for s in stations]), 1, 2),
+                {"units": "nT"},
+            ),
+            "tau": (
+                of_class,
+                np.moveaxis(np.array([s.tau_s for s in stations]), 1, 2),
+                {"units": "s"},
+            ),
             "storm": ("time", sample.storm(sample.time), {"units": "nT"}),
             "storm_share": (("observatory", "element"), np.array([s.storm for s in stations])),
             "kp": ("slot", sample.kp, {"units": "1"}),

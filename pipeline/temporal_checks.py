@@ -69,10 +69,10 @@ def _bounds(variables: Arrays) -> Finding:
         known = ~np.isnan(middle)
         # tau may be 0: a segment of white noise.
         least = middle > 0 if name.endswith("sigma") else middle >= 0
-        wrong += np.count_nonzero(known & ~least)
+        wrong += int(np.count_nonzero(known & ~least))
         if f"{name}_low" in variables:
             low, high = (variables[f"{name}_{end}"] for end in ("low", "high"))
-            wrong += np.count_nonzero(known & ((low > middle) | (high < middle)))
+            wrong += int(np.count_nonzero(known & ((low > middle) | (high < middle))))
     where = "of sigma and tau that are not positive, or outside their own bounds"
     return _count("temporal bounds", wrong, "values", where)
 

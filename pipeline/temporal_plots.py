@@ -129,7 +129,7 @@ def autocorrelation_figure(series: xr.Dataset, curves: xr.Dataset, fits: xr.Data
     segments = _segments(series, curves, fits)
     values, weights = autocorrelation(segments.values[TOTAL])
     values = np.where(weights > 0, values, np.nan)
-    lags = np.arange(values.shape[1]) * segments.step_s / _SECONDS_PER_HOUR
+    lags: Floats = np.arange(float(values.shape[1])) * segments.step_s / _SECONDS_PER_HOUR
     _title(figure, series, f"autocorrelation of {len(values)} residual segments, total field")
     known = np.flatnonzero(np.isfinite(values[:, 0]) & (values[:, 0] > 0))
     drawn = known[:: -(-len(known) // _MOST_CURVES) or 1]
@@ -238,8 +238,9 @@ def _legend_below(figure: Figure, axes: Axes) -> None:
 def _dates(axes: Axes) -> None:
     from matplotlib.dates import DateFormatter, DayLocator
 
-    axes.xaxis.set_major_locator(DayLocator(bymonthday=range(1, 32, 5)))
-    axes.xaxis.set_major_formatter(DateFormatter("%Y-%m-%d"))
+    every_fifth = DayLocator(bymonthday=range(1, 32, 5))  # type: ignore[no-untyped-call]
+    axes.xaxis.set_major_locator(every_fifth)
+    axes.xaxis.set_major_formatter(DateFormatter("%Y-%m-%d"))  # type: ignore[no-untyped-call]
 
 
 def _month_with_most_activity(

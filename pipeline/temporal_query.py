@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from magtiles.catalog.releases.reader import Release
     from magtiles.catalog.releases.temporal import TemporalModel
 
+Place = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.str_]]
 _ELEMENTS = ("north", "east", "down", "total")
 
 
@@ -37,12 +38,12 @@ def temporal_answers(
     return list(answers)
 
 
-def _add_baseline(answers: list[dict[str, Any]], model: TemporalModel, place: Any) -> None:
+def _add_baseline(answers: list[dict[str, Any]], model: TemporalModel, place: Place) -> None:
     if not model.months.size:
         for answer in answers:
             answer |= dict.fromkeys(("baseline", "standard_error", "days_outside"))
         return
-    found = model.baseline(*place)
+    found = model.baseline(place[0], place[1], place[2])
     for i, answer in enumerate(answers):
         answer |= {
             "baseline": _by_element(found.values[i]),
@@ -54,13 +55,13 @@ def _add_baseline(answers: list[dict[str, Any]], model: TemporalModel, place: An
 
 
 def _add_fogm(
-    answers: list[dict[str, Any]], model: TemporalModel, place: Any, kp: float | None
+    answers: list[dict[str, Any]], model: TemporalModel, place: Place, kp: float | None
 ) -> None:
     if not model.classes:
         for answer in answers:
             answer |= dict.fromkeys(("sigma", "tau", "tau_unidentified", "classes"))
         return
-    found = model.fogm(*place, kp=kp)
+    found = model.fogm(place[0], place[1], place[2], kp=kp)
     for i, answer in enumerate(answers):
         classes = {
             code: None if number < 0 else asdict(model.classes[number])

@@ -33,7 +33,8 @@ def temporal_positions(release: Release) -> dict[str, NDArray[np.float64]]:
     places = [middle]
     for station in model.observatories[:_OBSERVATORIES]:
         here = station.latitude, station.longitude
-        places += [here, tuple(0.6 * h + 0.4 * m for h, m in zip(here, middle, strict=True))]
+        between = 0.6 * here[0] + 0.4 * middle[0], 0.6 * here[1] + 0.4 * middle[1]
+        places += [here, between]
     latitude, longitude = np.round(np.repeat(places, len(_KP), axis=0).T, 4)
     seconds = model.variables.get("segment_start", model.variables.get("month"))
     assert seconds is not None  # a temporal model has curves or segments
