@@ -210,6 +210,41 @@ def test_json_of_no_known_schema_is_read_by_its_columns(tmp_path: Path) -> None:
         ingest(path, magnetometer_topic="/m", columns={"field_total": "b.g"}, units="nT")
 
 
+class Odd(NamedTuple):
+    fix: dict[str, Any]
+    says: str
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        Odd({"latitude": "45 N"}, "'latitude' holds text: '45 N'"),
+        Odd({"latitude": {"deg": 45}}, "holds {'deg': 45}; expected a number"),
+        Odd({"latitude": [4, 5]}, "'latitude' holds 2 numbers a message; expected one"),
+        Odd({"latitude": [[1], [1, 2]]}, "holds [[1], [1, 2]]"),
+        Odd({"timestamp": {"sec": "now", "nsec": 0}}, "a stamp is not a number"),
+        Odd({"timestamp": {"sec": None, "nsec": 0}}, "a stamp is not a number"),
+        Odd({"timestamp": 5}, "no field 'timestamp.sec'; expected under latitude, longitude"),
+    ],
+    ids=lambda case: case.says,
+)
+def test_json_of_other_kinds_is_refused(case: Odd, tmp_path: Path) -> None:
+    bag = drive(10, fixes=False)
+    whole = {
+        "latitude": 45.0, "longitude": 7.0, "altitude": None, "position_covariance": [],
+        "position_covariance_type": 0, "timestamp": {"sec": START // SECOND, "nsec": 0},
+    }  # fmt: skip
+    bag.json("/fix", "foxglove.LocationFix", whole, START)
+    bag.json("/fix", "foxglove.LocationFix", whole | {"position_covariance": [1.0]}, START)
+    right = bag.save(tmp_path / "right.mcap")
+    assert np.isnan(ingest(right, height_reference="ellipsoid")["fix_horizontal_sigma"]).all()
+    bag = drive(10, fixes=False)
+    bag.json("/fix", "foxglove.LocationFix", whole | case.fix, START)
+    with pytest.raises(FormatError) as raised:
+        ingest(bag.save(tmp_path / "wrong.mcap"), height_reference="ellipsoid")
+    assert case.says in str(raised.value)
+
+
 # What is wrong with a log: what it becomes all the same, or what the error says.
 
 

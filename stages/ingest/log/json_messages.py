@@ -53,11 +53,18 @@ def _value(message: Any, path: str, parts: list[str], where: str) -> Any:
 
 
 def column(values: list[Any], where: str) -> NDArray[Any]:
-    """Values of messages as an array of numbers or of text. Raises FormatError for others."""
-    plain = [np.nan if value is None else value for value in values]
+    """Values of messages as an array of numbers or text; lists are filled with NaN to one length.
+
+    Raises FormatError for others.
+    """
+    plain: list[Any] = [np.nan if value is None else value for value in values]
+    if any(isinstance(value, list) for value in plain):
+        lists = [value if isinstance(value, list) else [] for value in plain]
+        width = max(map(len, lists))
+        plain = [[*value, *[np.nan] * (width - len(value))] for value in lists]
     try:
         array = np.array(plain)
-    except ValueError:
+    except (ValueError, OverflowError):  # lists in lists
         array = np.array(None)
     if array.dtype.kind not in "biufU" or array.ndim == 0:
         odd = next((v for v in values if not isinstance(v, int | float | None)), values[0])

@@ -133,7 +133,9 @@ class _Cast:
                 return
             decode = self._decoder(channel, topic, where)
             columns = decode(batch.data, batch.start[rows], batch.stop[rows])
-            reduced = REDUCE[role]({n: columns[p] for n, p in topic.binding.columns.items()})
+            quantities = {n: columns[p] for n, p in topic.binding.columns.items()}
+            _check_quantities(quantities, topic.binding, where)
+            reduced = REDUCE[role](quantities)
             topic.add(reduced | self._times(topic, columns, batch.log_time[rows], where))
         except MagtilesError as caught:
             if topic is None:
@@ -212,6 +214,22 @@ class _Cast:
             name = "no schema" if schema is None else schema.name
             rows.append(f"{channel.topic} ({name}, {self._counts.get(channel.id, 0)} messages)")
         return "; ".join(rows) or "none, the file has no topics"
+
+
+def _check_quantities(quantities: dict[str, NDArray[Any]], binding: Binding, where: str) -> None:
+    for name, values in quantities.items():
+        if values.dtype.kind == "U":
+            raise FormatError(
+                f"field '{binding.columns[name]}' holds text: '{values.flat[0][:40]}'",
+                where=where,
+                expected="numbers",
+            )
+        if values.ndim > 1 and "covariance" not in name:
+            raise FormatError(
+                f"field '{binding.columns[name]}' holds {values.shape[1]} numbers a message",
+                where=where,
+                expected="one",
+            )
 
 
 def _warn_truncated(file: McapFile, messages: int, until: int) -> None:

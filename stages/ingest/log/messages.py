@@ -23,6 +23,8 @@ NED_FROM_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 FRD_FROM_FLU = np.diag([1.0, -1.0, -1.0])
 """ROS turns from forward, left, up to east, north, up (REP 103)."""
 
+_LEAST_NORM = 0.5  # of a quaternion: some drivers write zeros where they have none
+
 
 def _reduce_field(columns: Mapping[str, NDArray[Any]]) -> Columns:
     if "total" in columns:
@@ -40,15 +42,40 @@ def _reduce_field(columns: Mapping[str, NDArray[Any]]) -> Columns:
     return reduced
 
 
-def _keep(columns: Mapping[str, NDArray[Any]]) -> Columns:
-    return dict(columns)
+def _reduce_fix(columns: Mapping[str, NDArray[Any]]) -> Columns:
+    covariance, kind = columns.get("covariance"), columns.get("covariance_type")
+    reduced = {n: v for n, v in columns.items() if n not in ("covariance", "covariance_type")}
+    size = columns["latitude"].size
+    horizontal = vertical = np.full(size, np.nan)
+    if covariance is not None and kind is not None and covariance.shape == (size, 9):
+        variance = covariance.astype(np.float64)
+        horizontal, vertical = (
+            np.sqrt(np.where((kind > 0) & (v > 0), v, np.nan))
+            for v in (np.maximum(variance[:, 0], variance[:, 4]), variance[:, 8])
+        )
+    return {**reduced, "horizontal_sigma": horizontal, "vertical_sigma": vertical}
+
+
+def _reduce_attitude(columns: Mapping[str, NDArray[Any]]) -> Columns:
+    """Quaternions w, x, y, z and rates as given, NaN where the message measures none (-1)."""
+    quaternion = np.stack([columns[f"q{axis}"] for axis in "wxyz"], axis=1)
+    rate = np.stack([columns[f"rate_{axis}"] for axis in "xyz"], axis=1)
+    norm = np.linalg.norm(quaternion, axis=1)
+    known = np.isfinite(norm) & (norm > _LEAST_NORM) & (columns["covariance"][:, 0] != -1)
+    quaternion[~known] = np.nan
+    rate[columns["rate_covariance"][:, 0] == -1] = np.nan
+    return {"quaternion": quaternion, "rate": rate}
+
+
+def _reduce_speed(columns: Mapping[str, NDArray[Any]]) -> Columns:
+    return {"speed": np.hypot(columns["x"], columns["y"])}
 
 
 REDUCE: Mapping[Role, Callable[[Mapping[str, NDArray[Any]]], Columns]] = {
     "magnetometer": _reduce_field,
-    "fix": _keep,
-    "attitude": _keep,
-    "speed": _keep,
+    "fix": _reduce_fix,
+    "attitude": _reduce_attitude,
+    "speed": _reduce_speed,
 }
 """What is kept of each chunk's columns, so that a long log stays small in memory."""
 
@@ -71,22 +98,14 @@ def _fixes(columns: Columns, binding: Binding, params: IngestLogParams, topic: s
     order = in_order(columns, topic)
     blank = np.full(order.size, np.nan)
     status = columns["status"][order] if "status" in columns else np.zeros(order.size)
-    horizontal, vertical = blank, blank
-    if "covariance" in columns:
-        variance = columns["covariance"][order].astype(np.float64)
-        known = columns["covariance_type"][order] > 0
-        horizontal, vertical = (
-            np.sqrt(np.where(known & (v > 0), v, np.nan))
-            for v in (np.maximum(variance[:, 0], variance[:, 4]), variance[:, 8])
-        )
     return Fixes(
         columns["time"][order],
         columns["latitude"][order].astype(np.float64),
         columns["longitude"][order].astype(np.float64),
         columns["height"][order].astype(np.float64) if "height" in columns else blank,
         np.clip(status, -1, 2).astype(np.int8),
-        horizontal,
-        vertical,
+        columns["horizontal_sigma"][order],
+        columns["vertical_sigma"][order],
     )
 
 
@@ -95,18 +114,13 @@ def _attitudes(
 ) -> Attitudes:
     """From an IMU's axes to east, north, up (REP 103) as body to north, east, down."""
     order = in_order(columns, topic)
-    given = np.stack([columns[f"q{axis}"][order] for axis in "wxyz"], axis=1)
-    rate = np.stack([columns[f"rate_{axis}"][order] for axis in "xyz"], axis=1)
-    # -1 says that the message does not measure the quantity.
-    norm = np.linalg.norm(given, axis=1)
-    known = (columns["covariance"][order, 0] != -1) & np.isfinite(norm) & (norm > 0.5)
-    rate[columns["rate_covariance"][order, 0] == -1] = np.nan
+    quaternion = columns["quaternion"][order]
     stated = rotation(params.imu_to_body)
     to_body = FRD_FROM_FLU if stated is None else stated
-    quaternion = np.full(given.shape, np.nan)
+    known = np.isfinite(quaternion).all(axis=1)
     if known.any():
-        quaternion[known] = turned(given[known], NED_FROM_ENU, to_body)
-    return Attitudes(columns["time"][order], quaternion, rate @ to_body.T)
+        quaternion[known] = turned(quaternion[known], NED_FROM_ENU, to_body)
+    return Attitudes(columns["time"][order], quaternion, columns["rate"][order] @ to_body.T)
 
 
 def turned(quaternion: Real, world: Real, to_body: Real) -> Real:
@@ -118,8 +132,7 @@ def turned(quaternion: Real, world: Real, to_body: Real) -> Real:
 
 def _speeds(columns: Columns, binding: Binding, params: IngestLogParams, topic: str) -> Speeds:
     order = in_order(columns, topic)
-    velocity = np.stack([columns[axis][order] for axis in "xy"], axis=1)
-    return Speeds(columns["time"][order], np.linalg.norm(velocity, axis=1))
+    return Speeds(columns["time"][order], columns["speed"][order])
 
 
 BUILD: Mapping[Role, Callable[[Columns, Binding, IngestLogParams, str], Any]] = {

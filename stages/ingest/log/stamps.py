@@ -23,6 +23,9 @@ def stamps(
     """Nanoseconds since 1970 from seconds and nanoseconds, or from the one column of `paths`."""
     values = [columns[path] for path in paths]
     if len(values) == 2:
+        for value in values:
+            if value.dtype.kind not in "iuf" or not np.isfinite(value).all():
+                raise FormatError("a stamp is not a number", where=where)
         seconds, nanoseconds = (value.astype(np.int64) for value in values)
         return np.asarray(seconds * 10**9 + nanoseconds, dtype=np.int64)
     return instants(values[0], unit, where)
@@ -35,6 +38,8 @@ def instants(values: NDArray[Any], unit: str, where: str) -> NDArray[np.int64]:
     """
     if values.dtype.kind == "U":
         return np.array([_iso(str(value), where) for value in values], dtype=np.int64)
+    if values.dtype.kind not in "iuf":
+        raise FormatError(f"times are {values.dtype}", where=where, expected="numbers or text")
     scale = _NS_PER[unit]
     if values.dtype.kind in "iu":
         return np.asarray(values.astype(np.int64) * scale, dtype=np.int64)
