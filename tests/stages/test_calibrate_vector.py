@@ -220,6 +220,13 @@ def test_times_that_are_none(value: object) -> None:
         CalibrateVectorParams(start=value)
 
 
+def test_times_are_kept_in_utc() -> None:
+    zone = datetime.timezone(datetime.timedelta(hours=2))
+    given = datetime.datetime(2018, 8, 2, 10, 34, 30, tzinfo=zone)  # as TOML has it
+    params = CalibrateVectorParams(start=given, end="2018-08-02T08:35:30Z")
+    assert (params.start, params.end) == ("2018-08-02T08:34:30", "2018-08-02T08:35:30")
+
+
 def test_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source, out = tmp_path / "track.nc", tmp_path / "calibration.nc"
     write_artifact(track(whole_drive(), noise=200.0), source, "track/1")

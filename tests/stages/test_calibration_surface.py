@@ -126,12 +126,12 @@ def test_noise_costs_no_more_than_the_cramer_rao_bound(dims: int) -> None:
         errors.append(np.concatenate([(matrix - true)[lower], surface.bias - BIAS[:dims]]))
         stated += covariance[np.ix_(kept, kept)] / runs
     found = np.array(errors)
-    # Mean square error over the bound, all parameters together: measured 0.997 and 1.016, with a
+    # Mean square error over the bound, all parameters together: measured 1.022 and 1.015, with a
     # standard deviation of its own of 0.03. Errors 10 % larger would make it 1.21.
     overall = np.trace(np.linalg.solve(bound, found.T @ found / runs)) / len(bound)
     assert overall == pytest.approx(1.0, abs=0.06)
     each = np.sqrt(np.mean(found**2, axis=0) / np.diag(bound))
-    assert (each < 1.10).all()  # each to 3 %: measured 0.95 to 1.05
+    assert (each < 1.10).all()  # each to 4 %: measured 0.94 to 1.06
     # The covariance that a calibration states is that bound: measured within 0.3 %.
     assert np.trace(np.linalg.solve(bound, stated)) / len(bound) == pytest.approx(1.0, abs=0.02)
 
