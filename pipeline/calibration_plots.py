@@ -68,16 +68,17 @@ def calibration_figure(track: xr.Dataset, calibration: xr.Dataset) -> Figure:
 
     drawn = _drawn(track, calibration)
     figure = Figure(figsize=(11.0, 6.6), layout="constrained")
-    parts = figure.subfigures(1, 2, width_ratios=[1.0 if drawn.level else 0.62, 1.25])
+    widths = [1.0 if drawn.level else 0.62, 1.25]
+    left, right = np.ravel(figure.subfigures(1, 2, width_ratios=widths))
     planes = [(1, 0)] if drawn.level else [(1, 0), (0, 2)]
-    shown = list(parts[0].subplot_mosaic([[f"{plane}"] for plane in planes]).values())
+    shown = list(left.subplot_mosaic([[f"{plane}"] for plane in planes]).values())
     for panel, (across, up) in zip(shown, planes, strict=True):
         _draw_plane(panel, drawn, across, up)
     shown[0].legend(
         loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, frameon=False, fontsize=9,
         handletextpad=0.3, columnspacing=1.0, markerscale=4.0,
     )  # fmt: skip
-    _draw_in_time(parts[1], drawn, str(calibration.attrs["start"])[:19])
+    _draw_in_time(right, drawn, str(calibration.attrs["start"])[:19])
     figure.suptitle(_title(calibration), x=0.01, ha="left", weight="bold", size=11)
     return figure
 

@@ -67,8 +67,8 @@ def find_circles(seconds: Real, angle: Real, slowest_s: float) -> tuple[slice, f
         (np.abs(np.diff(turned[a : b + 1])).sum() / (2.0 * np.pi), a, b) for a, b in stretches
     ]
     most, first, last = max(driven)
-    first, last = _without_straight_ends(turned, first, last)
-    start, stop = np.searchsorted(seconds, [clock[first], clock[last]], side="left")
+    ends = _without_straight_ends(turned, int(first), int(last))
+    start, stop = np.searchsorted(seconds, clock[list(ends)], side="left")
     return slice(int(start), int(stop) + 1), float(most)
 
 
