@@ -69,7 +69,7 @@ def calibration_figure(track: xr.Dataset, calibration: xr.Dataset) -> Figure:
     drawn = _drawn(track, calibration)
     figure = Figure(figsize=(11.0, 6.6), layout="constrained")
     widths = [1.0 if drawn.level else 0.62, 1.25]
-    left, right = np.ravel(figure.subfigures(1, 2, width_ratios=widths))
+    left, right = np.asarray(figure.subfigures(1, 2, width_ratios=widths)).tolist()
     planes = [(1, 0)] if drawn.level else [(1, 0), (0, 2)]
     shown = list(left.subplot_mosaic([[f"{plane}"] for plane in planes]).values())
     for panel, (across, up) in zip(shown, planes, strict=True):
