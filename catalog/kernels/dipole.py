@@ -44,18 +44,38 @@ def dipole_field(points: Floats, positions: Floats, moments: Floats) -> tuple[Fl
     return _MU0_4PI * field, _MU0_4PI * _PER_KM * tensor
 
 
-def _sum_over_dipoles(p: Floats, s: Floats, m: Floats) -> tuple[Floats, Floats]:
+def dipole_vector(points: Floats, positions: Floats, moments: Floats) -> Floats:
+    """The field (n, 3) of `dipole_field` in nT without its gradient, in little over half the time."""
+    field = np.empty((len(points), 3))
+    step = max(1, _PAIRS // max(1, len(positions)))
+    for start in range(0, len(points), step):
+        part = slice(start, start + step)
+        field[part] = _vector_of(*_pairs(points[part], positions, moments))
+    return _MU0_4PI * field
+
+
+_Pairs = tuple[Floats, Floats, Floats, Floats, Floats, Floats]
+
+
+def _pairs(p: Floats, s: Floats, m: Floats) -> _Pairs:
+    """Points, positions, moments, and of each pair (n, k): r^2, 3 / r^5, 3 (m.r) / r^5."""
     # Every sum over dipoles is a matrix product once r = p - s is multiplied out. About the
     # points' own centre that costs no more than some 1e-12 of accuracy.
     centre = p.mean(axis=0)
     p, s = p - centre, s - centre
     r2 = (p**2).sum(axis=1)[:, None] + (s**2).sum(axis=1) - 2.0 * (p @ s.T)
-    m_r = p @ m.T - (s * m).sum(axis=1)
-    e = 3.0 / (r2**2 * np.sqrt(r2))  # 3 / r^5
-    b = m_r * e  # 3 (m.r) / r^5
+    e = 3.0 / (r2**2 * np.sqrt(r2))
+    return p, s, m, r2, e, (p @ m.T - (s * m).sum(axis=1)) * e
+
+
+def _vector_of(p: Floats, s: Floats, m: Floats, r2: Floats, e: Floats, b: Floats) -> Floats:
+    vector: Floats = b.sum(axis=1)[:, None] * p - b @ s - (e * r2 / 3.0) @ m
+    return vector
+
+
+def _sum_over_dipoles(p: Floats, s: Floats, m: Floats) -> tuple[Floats, Floats]:
+    p, s, m, r2, e, b = pairs = _pairs(p, s, m)
     c = 5.0 * b / r2  # 15 (m.r) / r^7
-    b0, b1 = b.sum(axis=1), b @ s
-    field = b0[:, None] * p - b1 - (e * r2 / 3.0) @ m
 
     # sum of e m_i r_j, of c r_i r_j
     m_s = (m[:, :, None] * s[:, None, :]).reshape(-1, 9)
@@ -64,8 +84,8 @@ def _sum_over_dipoles(p: Floats, s: Floats, m: Floats) -> tuple[Floats, Floats]:
     p_s = p[:, :, None] * (c @ s)[:, None, :]
     r_r = p[:, :, None] * p[:, None, :] * c.sum(axis=1)[:, None, None]
     r_r = r_r - p_s - p_s.transpose(0, 2, 1) + (c @ s_s).reshape(-1, 3, 3)
-    tensor = m_r_j + m_r_j.transpose(0, 2, 1) + b0[:, None, None] * np.eye(3) - r_r
-    return field, tensor
+    tensor = m_r_j + m_r_j.transpose(0, 2, 1) + b.sum(axis=1)[:, None, None] * np.eye(3) - r_r
+    return _vector_of(*pairs), tensor
 
 
 def dipole_field_geodetic(

@@ -35,6 +35,7 @@ def test_field_equals_that_of_another_library(scene):
     expected = 1e9 * expected[:, enu[0]] * enu[1]
     # 8e-10 measured: choclo takes mu0 as measured since 2019, 5e-10 from 4 pi 1e-7.
     np.testing.assert_allclose(field, expected, rtol=2e-9, atol=1e-9 * np.abs(expected).max())
+    np.testing.assert_array_equal(dipole.dipole_vector(points, positions, moments), field)
 
 
 def test_tensor_is_the_derivative_of_the_field(scene):
