@@ -25,7 +25,8 @@ def temporal_answers(
     """One answer for each position (n, 3): latitude, longitude (deg), height; None for no model.
 
     Keys: `baseline`, `standard_error`, `days_outside`, `sigma`, `tau`, `tau_unidentified`,
-    `classes`, None where the model has no such part; `weights` by observatory; `polar`.
+    `classes`, None where the model has no such part; `weights` by observatory; `dip_distance`
+    in degrees; `polar`.
     """
     count = len(positions)
     if release.manifest.temporal is None or not dates:
@@ -50,6 +51,7 @@ def _add_baseline(answers: list[dict[str, Any]], model: TemporalModel, place: Pl
             "standard_error": _by_element(found.standard_error[i]),
             "days_outside": float(found.days_outside[i]),
             "weights": dict(zip(found.observatories, found.weights[i].tolist(), strict=True)),
+            "dip_distance": float(found.dip_distance[i]),
             "polar": bool(found.polar[i]),
         }
 
@@ -78,6 +80,7 @@ def _add_fogm(
         answer.setdefault(
             "weights", dict(zip(found.observatories, found.weights[i].tolist(), strict=True))
         )
+        answer.setdefault("dip_distance", float(found.dip_distance[i]))
         answer.setdefault("polar", bool(found.polar[i]))
 
 

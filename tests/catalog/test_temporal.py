@@ -111,7 +111,7 @@ def test_observatories_count_by_dip_latitude_and_then_by_longitude(
     for _, north, east, theirs, _ in (MIDDLE, SOUTH):
         arc = np.angle(np.exp(1j * np.radians(lon - east)), deg=True)
         arc *= np.cos(np.radians((lat + north) / 2.0))
-        raw.append((0.25 + (dip - theirs) ** 2 + (arc / 5.0) ** 2) ** -2)
+        raw.append(1.0 / (0.01 + (dip - theirs) ** 2 + (arc / 8.0) ** 2))
     expected = np.array(raw) / np.sum(raw)
     found = model.baseline(lat, lon, "2024-03-01T05:00")
     assert found.weights == pytest.approx(expected, abs=1e-4)  # ppigrf's dip: 1e-5 degrees
@@ -120,12 +120,15 @@ def test_observatories_count_by_dip_latitude_and_then_by_longitude(
     curves = np.array([MIDDLE[4][:3], SOUTH[4][:3]]) * bump(minute) * (1.0 + 0.5 * weight)
     assert found.values[:3] == pytest.approx(expected @ curves, abs=0.01)
     assert found.values[3] == pytest.approx(found.values[:3] @ direction(lat, lon, MARCH), abs=1e-3)
+    away = abs(dip - np.array([MIDDLE[3], SOUTH[3]]))
+    assert found.dip_distance == pytest.approx(expected @ away, abs=0.01)
 
 
 def test_disagreement_of_observatories_widens_the_error(model: TemporalModel) -> None:
-    near, between = (model.baseline(lat, 10.0, "2024-02-15T11:20") for lat in (43.9, 34.0))
+    near, between = (model.baseline(lat, 10.0, "2024-02-15T11:20") for lat in (44.0, 34.0))
     assert near.weights[0] > 0.9999
-    assert near.standard_error[0] == pytest.approx(0.5, abs=0.25)
+    spread = np.sqrt(near.weights[1]) * 80.0  # 0.27 nT, for 0.02 degrees of dip latitude away
+    assert near.standard_error[0] == pytest.approx(np.hypot(0.5, spread), rel=1e-4)
     w = between.weights
     spread = np.sqrt(w[0] * w[1]) * 80.0  # of two values 80 nT apart
     assert between.standard_error[0] == pytest.approx(
