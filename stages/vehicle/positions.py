@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from magtiles.catalog.flags import TrackFlag
 from magtiles.catalog.kernels.geodesy import metres_per_degree, wrap_longitude
@@ -116,9 +116,11 @@ def attitude_at(time: Times, attitudes: Attitudes, *, max_gap_s: float) -> Real:
     known = (time >= at[0]) & (time <= at[-1])
     known &= _seconds(at[after] - at[after - 1]) <= max_gap_s
     if known.any():
-        turn = Rotation.from_quat(attitudes.quaternion[good], scalar_first=True)
-        even = Slerp(_seconds(at - at[0]), turn)
-        out[known] = even(_seconds(time[known] - at[0])).as_quat(scalar_first=True)
+        turns = Rotation.from_quat(attitudes.quaternion[good], scalar_first=True)
+        first, second = turns[after[known] - 1], turns[after[known]]
+        share = _share(time[known], at, after[known] - 1, after[known])
+        step = Rotation.from_rotvec(share[:, None] * (first.inv() * second).as_rotvec())
+        out[known] = (first * step).as_quat(scalar_first=True)
     return out
 
 
@@ -175,11 +177,16 @@ def interpolated(time: Times, at: Times, values: Real, *, max_gap_s: float) -> R
 def _between(
     time: Times, at: Times, values: Real, before: NDArray[np.intp], after: NDArray[np.intp]
 ) -> Real:
-    # Differences of times first: nanoseconds since 1970 do not fit a float.
-    span = _seconds(at[after] - at[before])
-    share = np.divide(_seconds(time - at[before]), span, out=np.zeros_like(span), where=span > 0)
+    share = _share(time, at, before, after)
     mixed: Real = (1.0 - share) * values[before] + share * values[after]
     return mixed
+
+
+def _share(time: Times, at: Times, before: NDArray[np.intp], after: NDArray[np.intp]) -> Real:
+    """How far each time lies from the sample before it to the one after: 0 to 1."""
+    # Differences of times first: nanoseconds since 1970 do not fit a float.
+    span = _seconds(at[after] - at[before])
+    return np.divide(_seconds(time - at[before]), span, out=np.zeros_like(span), where=span > 0)
 
 
 def _seconds(span: NDArray[np.timedelta64]) -> Real:

@@ -611,6 +611,24 @@ def test_a_length_that_is_not_to_be_believed_allocates_nothing(tmp_path: Path) -
         ingest(path)
 
 
+def test_damage_that_no_crc_tells_ends_in_an_error_of_ours_or_in_a_track(tmp_path: Path) -> None:
+    bag = drive(60, compression=CompressionType.NONE, options={"enable_crcs": False})
+    for row in range(10):
+        bag.imu(START + row * SECOND // 5, (0, 0, 0, 1))
+    whole, path = bag.finish(), tmp_path / "log.mcap"
+    rng = np.random.default_rng(11)
+    refused = 0
+    for _ in range(300):
+        data = bytearray(whole)
+        data[int(rng.integers(len(data)))] ^= int(rng.integers(1, 256))
+        path.write_bytes(data)
+        try:
+            ingest(path)
+        except MagtilesError:
+            refused += 1
+    assert 30 < refused < 270  # most bytes are values that may be anything
+
+
 def test_crcs_are_those_of_zlib() -> None:
     """The damage above is found by the CRC and by nothing else: with the CRC right, it is not."""
     whole = drive(compression=CompressionType.NONE).finish()

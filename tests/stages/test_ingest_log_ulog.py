@@ -195,6 +195,14 @@ def test_several_sensors_are_asked_about(tmp_path: Path) -> None:
         ingest(none)
 
 
+def test_a_topic_whose_format_lacks_a_field_is_named(tmp_path: Path) -> None:
+    fields = GPS.replace("float epv;", "float xpv;")
+    topics = {"sensor_mag": mags(), "vehicle_gps_position": (fields, gps()[1])}
+    path = save(tmp_path / "log.ulg", topics)
+    with pytest.raises(FormatError, match=r"topic vehicle_gps_position: messages have no .* 'epv'"):
+        ingest(path)
+
+
 @pytest.mark.parametrize("percent", range(0, 100, 10))
 def test_a_truncated_log_keeps_its_whole_messages(
     percent: int, tmp_path: Path, caplog: pytest.LogCaptureFixture

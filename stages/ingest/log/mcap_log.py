@@ -135,7 +135,8 @@ class _Cast:
             columns = decode(batch.data, batch.start[rows], batch.stop[rows])
             quantities = {n: columns[p] for n, p in topic.binding.columns.items()}
             _check_quantities(quantities, topic.binding, where)
-            reduced = REDUCE[role](quantities)
+            with np.errstate(over="ignore", invalid="ignore"):  # damaged values are told later
+                reduced = REDUCE[role](quantities)
             topic.add(reduced | self._times(topic, columns, batch.log_time[rows], where))
         except MagtilesError as caught:
             if topic is None:

@@ -157,7 +157,8 @@ class _Assembly:
 
     def _field(self) -> dict[str, Any]:
         samples = self.raw.samples
-        values = samples.values[self.order] * _factor(samples, self.params, self.where)
+        with np.errstate(over="ignore", invalid="ignore"):  # damaged values are refused below
+            values = samples.values[self.order] * _factor(samples, self.params, self.where)
         place = f"{self.path} topic {samples.topic}"
         _check_field(values, place)
         self.flag[~np.isfinite(values.reshape(values.shape[0], -1)).all(axis=1)] |= (

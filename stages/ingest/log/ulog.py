@@ -43,6 +43,22 @@ _STATUS = np.array([-1, -1, 0, 0, 2, 2, 2, -1, -1], dtype=np.int8)
 """By `fix_type`: none twice, 2-D, 3-D, differential, RTK float and fixed, unused, extrapolated."""
 
 
+class _Columns(dict[str, NDArray[Any]]):
+    """Columns of a topic; one that it lacks is a FormatError that names both."""
+
+    def __init__(self, columns: Mapping[str, NDArray[Any]], where: str) -> None:
+        super().__init__(columns)
+        self._where = where
+
+    def __missing__(self, name: str) -> NDArray[Any]:
+        raise FormatError(
+            f"messages have no field '{name}'",
+            where=self._where,
+            expected=f"it among {', '.join(self)}",
+            remedy="it is another topic under a known name",
+        )
+
+
 @dataclass(frozen=True)
 class Dataset:
     """One instance of a logged topic: its columns, with `timestamp` in microseconds since boot."""
@@ -104,11 +120,12 @@ def read_datasets(path: Path, names: Sequence[str] | None) -> list[Dataset]:
         ) from None
     _warn_damaged(path, log)
     repeated = {d.name for d in log.data_list if d.multi_id > 0}
-    return [
-        Dataset(f"{d.name}/{d.multi_id}" if d.name in repeated else d.name, d.data)
-        for d in log.data_list
-        if len(d.data["timestamp"])
-    ]
+    sets = []
+    for data in log.data_list:
+        topic = f"{data.name}/{data.multi_id}" if data.name in repeated else data.name
+        if len(data.data.get("timestamp", ())):
+            sets.append(Dataset(topic, _Columns(data.data, f"{path} topic {topic}")))
+    return sets
 
 
 def _warn_damaged(path: Path, log: ULog) -> None:
@@ -232,7 +249,7 @@ def _fixes(receiver: Dataset, height: Real, clock: BootClock | None) -> Fixes:
     columns = receiver.columns
     time = _times(columns["timestamp"], clock)
     order = rising(time)
-    kind = np.minimum(columns["fix_type"], _STATUS.size - 1)
+    kind = np.clip(np.nan_to_num(columns["fix_type"]).astype(np.int64), 0, _STATUS.size - 1)
     if "latitude_deg" in columns:
         latitude, longitude = columns["latitude_deg"], columns["longitude_deg"]
     else:
