@@ -1,9 +1,10 @@
-"""Files inside gzip and zip, unpacked beside nothing: into a folder that is removed after."""
+"""Files inside gzip, xz and zip, unpacked beside nothing: into a folder that is removed after."""
 
 from __future__ import annotations
 
 import contextlib
 import gzip
+import lzma
 import shutil
 import tempfile
 import zipfile
@@ -21,12 +22,13 @@ class _Readable(Protocol):
 
 _LIMIT_BYTES = 16 << 30
 _BLOCK_BYTES = 1 << 20
-_PACKED = {b"\x1f\x8b": "gzip", b"PK\x03\x04": "zip"}
+_PACKED = {b"\x1f\x8b": "gzip", b"\xfd7zXZ\x00": "xz", b"PK\x03\x04": "zip"}
+_OPEN = {"gzip": (gzip.open, ".gz"), "xz": (lzma.open, ".xz")}
 
 
 @contextlib.contextmanager
 def unpacked(path: Path, member: str | None = None) -> Iterator[Path]:
-    """The file itself, or what the gzip or zip file at `path` holds, for as long as it is used.
+    """The file itself, or what the gzip, xz or zip file at `path` holds, for as long as it is used.
 
     Parameters
     ----------
@@ -46,8 +48,15 @@ def unpacked(path: Path, member: str | None = None) -> Iterator[Path]:
 
 def _unpack(kind: str, path: Path, folder: Path, member: str | None) -> Path:
     try:
-        return _gunzip(path, folder) if kind == "gzip" else _unzip(path, folder, member)
-    except (OSError, EOFError, zlib.error, zipfile.BadZipFile, RuntimeError) as caught:
+        return _unzip(path, folder, member) if kind == "zip" else _expand(kind, path, folder)
+    except (
+        OSError,
+        EOFError,
+        zlib.error,
+        lzma.LZMAError,
+        zipfile.BadZipFile,
+        RuntimeError,
+    ) as caught:
         raise FormatError(
             f"is not a whole {kind} file: {caught}", where=path, remedy="fetch it again"
         ) from None
@@ -56,15 +65,16 @@ def _unpack(kind: str, path: Path, folder: Path, member: str | None) -> Path:
 def _kind(path: Path) -> str | None:
     try:
         with path.open("rb") as file:
-            head = file.read(4)
+            head = file.read(6)
     except OSError:
         return None  # whoever reads it says what is wrong
     return next((kind for magic, kind in _PACKED.items() if head.startswith(magic)), None)
 
 
-def _gunzip(path: Path, folder: Path) -> Path:
-    out = folder / (path.stem if path.suffix.lower() == ".gz" else path.name)
-    with gzip.open(path) as packed:
+def _expand(kind: str, path: Path, folder: Path) -> Path:
+    opener, suffix = _OPEN[kind]
+    out = folder / (path.stem if path.suffix.lower() == suffix else path.name)
+    with opener(path) as packed:
         _copy(packed, out, path)
     return out
 

@@ -54,6 +54,9 @@ class RawLog:
     height_reference : what the format's heights count from; None where it does not say.
     rows : what the log has for every sample itself (n,), by its name in track/1: `latitude`,
         `longitude`, `height`, `speed`, `line`, `flight`, ...
+    row_attrs : attributes of those of `rows` that track/1 does not define.
+    run : (n,) changes wherever samples do not follow those before them, as at a survey's next
+        line; None of a logger's own record, by one clock.
     attrs : notes for the track's attributes.
     """
 
@@ -64,6 +67,8 @@ class RawLog:
     clock: Literal["utc", "boot"] = "utc"
     height_reference: str | None = None
     rows: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    row_attrs: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    run: NDArray[np.int64] | None = None
     attrs: Mapping[str, Any] = field(default_factory=dict)
 
 

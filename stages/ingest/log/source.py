@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import pydantic
 
-from magtiles.stages.declare import Params, quantity
+from magtiles.stages.declare import IsoDate, Params, quantity
 from magtiles.stages.ingest.source import SourceKind
 
 Vector = tuple[float, float, float]
@@ -65,14 +65,30 @@ UtcTime = Annotated[str, pydantic.BeforeValidator(_utc)]
 class Columns(Params):
     """Which column, or which field of a message (``a.b.c``), holds what."""
 
-    time: str | None = quantity("1", default=None, doc="Time: ISO text or a number of time_unit.")
+    time: str | None = quantity(
+        "1", default=None, doc="Time: text, or a number since 1970 or, with a date, since midnight."
+    )
+    date: str | None = quantity("1", default=None, doc="Date, as date_format.")
+    year: str | None = quantity("1", default=None, doc="Year, with day_of_year.")
+    day_of_year: str | None = quantity("1", default=None, doc="Day of the year, from 1.")
     field_total: str | None = quantity("1", default=None, doc="Total field.")
     field_x: str | None = quantity("1", default=None, doc="Field along the sensor's x.")
     field_y: str | None = quantity("1", default=None, doc="Field along the sensor's y.")
     field_z: str | None = quantity("1", default=None, doc="Field along the sensor's z.")
     latitude: str | None = quantity("1", default=None, doc="Latitude, degrees.")
     longitude: str | None = quantity("1", default=None, doc="Longitude, degrees.")
+    easting: str | None = quantity("1", default=None, doc="Easting in crs.")
+    northing: str | None = quantity("1", default=None, doc="Northing in crs.")
     height: str | None = quantity("1", default=None, doc="Height, m.")
+    speed: str | None = quantity("1", default=None, doc="Speed over ground.")
+    line: str | None = quantity("1", default=None, doc="Survey line.")
+    flight: str | None = quantity("1", default=None, doc="Flight.")
+    diurnal: str | None = quantity(
+        "1", default=None, doc="Variation in time, or a base station's total field."
+    )
+    source: dict[str, str] = quantity(
+        "1", default={}, doc="The survey's own columns to keep, each as source_<name>."
+    )
 
 
 class IngestLogParams(Params):
@@ -122,11 +138,42 @@ class IngestLogParams(Params):
     start_time: UtcTime | None = quantity(
         "1", default=None, doc="UTC of the first sample of the field, where no clock is UTC."
     )
-    time_unit: Literal["s", "ms", "us", "ns"] = quantity(
+    time_unit: Literal["ns", "us", "ms", "s", "min", "h", "day"] = quantity(
         "1", default="s", doc="Unit of a numeric column of times."
+    )
+    time_format: str | None = quantity(
+        "1", default=None, doc="Layout of a column of times, such as %H%M%S; default ISO."
+    )
+    date_format: str = quantity("1", default="%Y%m%d", doc="Layout of a column of dates.")
+    date: IsoDate | None = quantity(
+        "1", default=None, doc="Date of all rows, where times count from its midnight."
+    )
+    utc_offset_h: float | None = quantity(
+        "h", default=None, ge=-14, le=14, doc="How much a table's local time is ahead of UTC."
     )
     max_gap_s: float = quantity(
         "s", default=2.0, gt=0, doc="Longest gap between fixes to interpolate over."
+    )
+    crs: str | None = quantity(
+        "1", default=None, doc="CRS of a table's coordinates: EPSG code, PROJ string or WKT."
+    )
+    allow_ballpark_datum: bool = quantity(
+        "1", default=False, doc="Accept a datum whose relation to WGS84 is not known."
+    )
+    height_m: float | None = quantity(
+        "m", default=None, doc="Height of all rows, where no column holds it."
+    )
+    diurnal_datum_nt: float | None = quantity(
+        "nT", default=None, doc="Quiet level that comes off a base station's total field."
+    )
+    column_units: dict[str, str] | None = quantity(
+        "1", default=None, doc="Units of columns whose file does not say."
+    )
+    no_data: float | None = quantity(
+        "1", default=None, doc="Number that marks a missing value in a table."
+    )
+    member: str | None = quantity(
+        "1", default=None, doc="File of a zip archive that holds several."
     )
     columns: Columns | None = quantity(
         "1", default=None, doc="Where a table or a message of no known schema holds what."

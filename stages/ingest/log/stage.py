@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -15,13 +16,21 @@ from numpy.typing import NDArray
 from magtiles.catalog.flags import TrackFlag, flag_attributes
 from magtiles.schemas.errors import FormatError, SourceError
 from magtiles.stages.declare import FILES, Stage
+from magtiles.stages.ingest.log.aseg import read_aseg
+from magtiles.stages.ingest.log.delimited import read_csv
+from magtiles.stages.ingest.log.hdf5 import read_hdf5
 from magtiles.stages.ingest.log.mcap_log import read_mcap
+from magtiles.stages.ingest.log.order import out_of_order
 from magtiles.stages.ingest.log.raw import FieldSamples, RawLog
 from magtiles.stages.ingest.log.sniff import log_format
 from magtiles.stages.ingest.log.source import TRACK, IngestLogParams, rotation
+from magtiles.stages.ingest.log.table import Table
+from magtiles.stages.ingest.log.table_log import table_log
+from magtiles.stages.ingest.log.trackline import read_mgd77, read_mgd77t, read_trackline_csv
 from magtiles.stages.ingest.log.ulog import read_ulog
 from magtiles.stages.ingest.raw import nanotesla_per
-from magtiles.stages.ingest.source import locate, merge
+from magtiles.stages.ingest.source import locate_all, merge
+from magtiles.stages.ingest.unpack import unpacked
 from magtiles.stages.vehicle.positions import (
     Fixes,
     Positions,
@@ -39,6 +48,16 @@ _READERS: dict[str, Callable[[Path, IngestLogParams], RawLog]] = {
     "mcap": read_mcap,
     "ulog": read_ulog,
 }
+_TABLES: dict[str, Callable[[Path, IngestLogParams, str], Table]] = {
+    "csv": read_csv,
+    "hdf5": read_hdf5,
+    "mgd77": read_mgd77,
+    "mgd77t": read_mgd77t,
+    "trackline": read_trackline_csv,
+}
+_DEFINITION = ".dfn"
+_BESIDE = (".des", ".met", ".txt", ".pdf", ".h77", ".h77t")
+"""Descriptions for people that may be named with the data; nothing is read of them."""
 _CREDIBLE_NT = 1e6
 """No sensor on a vehicle that could be calibrated reads more; the core field is 22,000-67,000."""
 
@@ -48,7 +67,8 @@ def ingest_log(files: Sequence[Path], *, params: IngestLogParams) -> xr.Dataset:
 
     Parameters
     ----------
-    files : the log (MCAP or PX4 ULog), its source TOML, or both.
+    files : the log (MCAP, PX4 ULog, ASEG-GDF2 with its definitions, MGD77, MGD77T, trackline CSV,
+        HDF5 or CSV; also inside gzip, xz or zip), its source TOML, or both.
     params : the [log] keys of the TOML; either may state them.
 
     Raises
@@ -57,9 +77,12 @@ def ingest_log(files: Sequence[Path], *, params: IngestLogParams) -> xr.Dataset:
     SourceError : a key is missing or contradicts the log; several sensors could be meant.
     IntegrityError : the file's digest is not the one its source states.
     """
-    path, source = locate([Path(f) for f in files], TRACK)
+    found, source = locate_all([Path(f) for f in files], TRACK)
     params = merge(params, source)
-    raw = _READERS[log_format(path)](path, params)
+    path, definition = _data_file(found)
+    raw = _read(path, definition, params)
+    if raw.rows:
+        params = params.model_copy(update={"units": None})  # a table's columns are in nT by now
     where = str(path) if source is None else f"{source.path} [log]"
     name = path.name if source is None else source.source.id
     return _Assembly(raw, params, path, where).dataset(name)
@@ -73,6 +96,42 @@ STAGE = Stage(
     output="track/1",
     run=ingest_log,
 )
+
+
+def _data_file(found: Sequence[Path]) -> tuple[Path, Path | None]:
+    """The file of data, and that of its definitions, if any."""
+    kinds = {path: _plain_suffix(path) for path in found}
+    definitions = [path for path, kind in kinds.items() if kind == _DEFINITION]
+    data = [p for p, kind in kinds.items() if kind not in (_DEFINITION, *_BESIDE)]
+    if len(data) != 1 or len(definitions) > 1:
+        raise SourceError(
+            f"{len(data)} data files: {', '.join(sorted(p.name for p in data)) or 'none'}, "
+            f"{len(definitions)} of definitions",
+            where="files",
+            expected="one file, with one of definitions where its format has them",
+            remedy="ingest each alone",
+        )
+    return data[0], definitions[0] if definitions else None
+
+
+def _plain_suffix(path: Path) -> str:
+    name = path.with_suffix("") if path.suffix.lower() in (".gz", ".xz") else path
+    return name.suffix.lower()
+
+
+def _read(path: Path, definition: Path | None, params: IngestLogParams) -> RawLog:
+    with contextlib.ExitStack() as stack:
+        plain = stack.enter_context(unpacked(path, params.member))
+        beside = plain.with_suffix(_DEFINITION)
+        if definition is None and plain != path and beside.is_file():
+            definition = beside  # of the same archive
+        if definition is not None:
+            defined = stack.enter_context(unpacked(definition))
+            return table_log(read_aseg(plain, defined, params, str(path)), params)
+        kind = log_format(plain)
+        if kind in _READERS:
+            return _READERS[kind](plain, params)
+        return table_log(_TABLES[kind](plain, params, str(path)), params)
 
 
 class _Assembly:
@@ -133,12 +192,10 @@ class _Assembly:
         return np.timedelta64(first - self.raw.samples.time[0], "ns")
 
     def _flag_clock(self, recorded: Times) -> None:
-        """CLOCK_STEP for rows that an earlier one had overtaken or that have no own time."""
-        latest = np.maximum.accumulate(recorded)
-        late = np.zeros(recorded.size, dtype=bool)
-        late[1:] = recorded[1:] <= latest[:-1]
+        """CLOCK_STEP for rows whose time breaks the order, or that have no own time."""
+        late = out_of_order(recorded, self.raw.run)
         back = np.flatnonzero(np.diff(recorded) < np.timedelta64(0))
-        if back.size:
+        if back.size and late.any():
             row = int(back[0]) + 1
             _LOG.warning(
                 "%s: time goes back %d times, first at sample %d from %s to %s; "
@@ -229,7 +286,8 @@ class _Assembly:
     def _rows(self) -> dict[str, Any]:
         rows = {k: v[self.order] for k, v in self.raw.rows.items() if k not in _PLACES}
         variables: dict[str, Any] = {
-            name: (("time",), values, _ROW_ATTRS.get(name, {})) for name, values in rows.items()
+            name: (("time",), values, _ROW_ATTRS.get(name) or self.raw.row_attrs.get(name, {}))
+            for name, values in rows.items()
         }
         if self.raw.speeds is not None:
             speed = interpolated(

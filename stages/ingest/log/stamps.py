@@ -14,7 +14,8 @@ from magtiles.schemas.errors import FormatError
 CREDIBLE = np.datetime64("1980-01-06", "ns")
 """GPS time begins; a clock before it shows no date."""
 
-_NS_PER = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
+_NS_PER = {"day": 86400 * 10**9, "h": 3600 * 10**9, "min": 60 * 10**9}
+_NS_PER |= {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 
 
 def stamps(

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from mcap.records import Channel, Schema
 
-from magtiles.schemas.errors import MagtilesError
+from magtiles.schemas.errors import FormatError, MagtilesError
 from magtiles.stages.ingest.log.bindings import Role, binding_of, role_of
 from magtiles.stages.ingest.log.decoders import decoder, ros_layout
 from magtiles.stages.ingest.log.mcap_file import McapFile
@@ -76,7 +76,15 @@ class LogSummary:
 
 def summarize_log(path: Path) -> LogSummary:
     """Read a log through, CRCs and all, and say what it holds. Raises FormatError."""
-    return _SUMMARIES[log_format(path)](path)
+    kind = log_format(path)
+    if kind not in _SUMMARIES:
+        raise FormatError(
+            f"is a table ({kind}), without topics",
+            where=path,
+            expected="MCAP or ULog",
+            remedy="look at it with a text editor, and name its columns in a source TOML",
+        )
+    return _SUMMARIES[kind](path)
 
 
 @dataclass
