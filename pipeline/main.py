@@ -37,6 +37,7 @@ BAD_DATA, BAD_USE, INTERRUPTED, BROKEN_PIPE = 1, 2, 130, 141
 
 _EXTRA = (
     "cdflib",
+    "cryptography",
     "google.protobuf",
     "h5py",
     "harmonica",
@@ -48,6 +49,7 @@ _EXTRA = (
     "ppigrf",
     "pydantic",
     "pyproj",
+    "pystac",
     "pyulog",
     "rasterio",
     "rich",
