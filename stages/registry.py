@@ -18,6 +18,7 @@ from magtiles.stages.ingest import grid, index
 from magtiles.stages.ingest.log import stage as log
 from magtiles.stages.ingest.observatory import stage as observatory
 from magtiles.stages.release import expect_total, tiles
+from magtiles.stages.road import resample
 from magtiles.stages.temporal import assemble, baseline, check, diurnal, fit_fogm
 from magtiles.stages.vehicle.calibration import apply as apply_calibration
 from magtiles.stages.vehicle.calibration import calibrate
@@ -34,6 +35,7 @@ STAGES: tuple[Stage, ...] = (
     expect_total.STAGE,
     fit_tolles_lawson.STAGE,
     apply_tolles_lawson.STAGE,
+    resample.STAGE,
     evaluate_model.STAGE,
     core_field.GRID_STAGE,
     core_field.TRACK_STAGE,
