@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from magtiles.pipeline.steps import MapPlan, Steps
 from magtiles.pipeline.survey_map import plan_survey_map
 from magtiles.pipeline.temporal_part import TemporalResult, build_temporal
 from magtiles.schemas.errors import CoverageError, MagtilesError, ParameterError, SourceError
+from magtiles.stages.release.provenance import resource, slsa_predicate
 from magtiles.stages.release.publish import PublishResult, publish_release
 from magtiles.stages.release.records import MeasuredTile
 
@@ -138,26 +139,40 @@ def _publish(
         tiles=cut,
         identity={},
         inputs=inputs,
-        provenance=_provenance(wanted, plan, artifacts),
+        provenance=_provenance(wanted, plan, inputs, artifacts),
         extra_files=extra,
     )
 
 
-def _provenance(wanted: Product, plan: MapPlan, artifacts: Sequence[Path]) -> dict[str, Any]:
-    """How the release was made: every artifact with its stage, parameters and inputs."""
-    steps = []
-    for artifact in artifacts:
-        if (receipt := receipts.read_receipt(artifact)) is not None:
-            kept = {k: receipt[k] for k in ("stage", "version", "params", "inputs")}
-            steps.append({"artifact": artifact.name, **kept})
-    return {
-        "product": _named_digest(wanted.path),
-        "source": _named_digest(plan.source),
-        "steps": steps,
-        "packages": receipts.package_versions(),
-        "code": receipts.code_digest(),
-    }
+def _provenance(
+    wanted: Product,
+    plan: MapPlan,
+    inputs: Sequence[Mapping[str, str]],
+    artifacts: Sequence[Path],
+) -> dict[str, Any]:
+    """How the release was made: what was asked for, its inputs, every artifact with its stage."""
+    sources = [plan.source]
+    if wanted.temporal is not None:
+        sources += [s.path for s in (*wanted.temporal.observatories, *wanted.temporal.indices)]
+    return slsa_predicate(
+        parameters={
+            "product": _described(wanted.path),
+            "sources": [_described(source) for source in sources],
+        },
+        internal={"code": receipts.code_digest()},
+        inputs=inputs,
+        packages=receipts.package_versions(),
+        byproducts=[
+            resource(
+                artifact.name,
+                receipt["output"]["sha256"],
+                **{key: receipt[key] for key in ("stage", "version", "params", "inputs")},
+            )
+            for artifact in artifacts
+            if (receipt := receipts.read_receipt(artifact)) is not None
+        ],
+    )
 
 
-def _named_digest(file: Path) -> dict[str, str]:
-    return {"file": file.name} | ({"sha256": receipts.digest(file)} if file.is_file() else {})
+def _described(file: Path) -> dict[str, Any]:
+    return resource(file.name, receipts.digest(file) if file.is_file() else None)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 import importlib.metadata
 import json
 import os
@@ -37,6 +36,8 @@ from magtiles.schemas import contracts
 from magtiles.schemas.errors import ContractError, SourceError, VersionError
 from magtiles.stages.release.atomic import sync, write_bytes
 from magtiles.stages.release.checks import CHECKS_NAME, make_checks, replay_checks
+from magtiles.stages.release.provenance import CONTRACT as PROVENANCE_CONTRACT
+from magtiles.stages.release.provenance import build_date, statement
 from magtiles.stages.release.records import (
     IDENTITY_ATTRIBUTES,
     MeasuredTile,
@@ -85,7 +86,7 @@ def publish_release(
     identity : what the release is, beyond the tiles' reference field, epoch and definition;
         a value that contradicts the tiles raises ContractError.
     inputs : the sources, each with the keys id, sha256, licence and role.
-    provenance : how it was made, any JSON.
+    provenance : how it was made, as `slsa_predicate` says it.
     extra_files : ``preview/*``, ``core_field.shc`` and ``temporal.nc`` (as `write_temporal`
         makes it, and with a core field), path in the release to file.
 
@@ -108,14 +109,13 @@ def publish_release(
     measured.sort(key=lambda t: str(t.entry["path"]))
     document = _document(product, version, measured, identity, inputs)
     extras = {path: _extra(path, file) for path, file in sorted(extra_files.items())}
-    files = {PROVENANCE_NAME: canonical_json(provenance), **extras}
     final = home / version
-    _add_files(document, files)
+    _add_files(document, extras)
     if TEMPORAL_PATH in extra_files:
         _add_temporal(document, extra_files)
     changed = not _exists_already(home, _sealed(document))
     if changed:
-        _build(home, final, document, measured, files)
+        _build(home, final, document, measured, extras, provenance)
     _point_to_latest(home)
     return PublishResult(final, changed)
 
@@ -165,10 +165,8 @@ def _document(
             {**t.entry, "bounds": lattice.bounds(t.entry["row"], t.entry["column"])} for t in tiles
         ],
     }
-    if "SOURCE_DATE_EPOCH" in os.environ:
-        seconds = int(os.environ["SOURCE_DATE_EPOCH"])
-        moment = datetime.datetime.fromtimestamp(seconds, tz=datetime.UTC)
-        document["created"] = moment.strftime("%Y-%m-%dT%H:%M:%SZ")
+    if (date := build_date()) is not None:
+        document["created"] = date
     return document
 
 
@@ -255,6 +253,7 @@ def _build(
     document: dict[str, Any],
     tiles: Sequence[MeasuredTile],
     files: Mapping[str, bytes],
+    provenance: Mapping[str, Any],
 ) -> None:
     """Build in a temporary sibling and rename it to `final`; on failure nothing stays."""
     staging = home / f"{_STAGING}{socket.gethostname()}.{os.getpid()}"
@@ -267,7 +266,7 @@ def _build(
         for path, data in files.items():
             (staging / path).parent.mkdir(exist_ok=True)
             (staging / path).write_bytes(data)
-        _complete(staging, document)
+        _complete(staging, document, provenance)
         _protect(staging)
         _rename(staging, final)
     except BaseException:
@@ -284,15 +283,25 @@ def _copy(tile: MeasuredTile, staging: Path) -> None:
     (staging / str(tile.entry["path"])).write_bytes(data)
 
 
-def _complete(staging: Path, document: dict[str, Any]) -> None:
-    """Add the checks and the final manifest, then read the release back and try it."""
+def _complete(staging: Path, document: dict[str, Any], provenance: Mapping[str, Any]) -> None:
+    """Add checks, provenance and the final manifest, then read the release back and try it."""
     write_bytes(staging / MANIFEST_NAME, _seal(document))
     checks = canonical_json(make_checks(open_release(staging)))
     (staging / CHECKS_NAME).write_bytes(checks)
     _add_files(document, {CHECKS_NAME: checks})
+    made = canonical_json(_provenance(document, provenance))
+    (staging / PROVENANCE_NAME).write_bytes(made)
+    _add_files(document, {PROVENANCE_NAME: made})
     contracts.check_document(json.loads(_seal(document)), CONTRACT, where=MANIFEST_NAME)
     write_bytes(staging / MANIFEST_NAME, _seal(document))
     replay_checks(open_release(staging))
+
+
+def _provenance(document: Mapping[str, Any], predicate: Mapping[str, Any]) -> dict[str, Any]:
+    """The statement of how every file that the manifest lists so far was made."""
+    made = statement({file["path"]: file["sha256"] for file in document["files"]}, predicate)
+    contracts.check_document(made, PROVENANCE_CONTRACT, where=PROVENANCE_NAME)
+    return made
 
 
 def _protect(staging: Path) -> None:

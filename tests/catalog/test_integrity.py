@@ -229,7 +229,7 @@ def test_tiles_and_files_come_verified(release: Release) -> None:
     for tile in tiles:
         assert array_digest(tile.variables) == tile.record.array_digest
         assert tile.attributes["contract"] == "anomaly-tile/1.0.0"
-    assert json.loads(release.file("provenance.json")) == {"made": "in a test"}
+    assert json.loads(release.file("provenance.json"))["_type"].startswith("https://in-toto.io/")
     with pytest.raises(IntegrityError, match="is not part of the release"):
         release.file("../latest.json")
 

@@ -189,7 +189,8 @@ def test_manifest_says_what_it_is(pacific):
     assert "crust WORLD-72 of degrees 16 to 72" in manifest.identity["anomaly_definition"]
     assert [(i.id, i.role) for i in manifest.inputs] == [("world-model", "field model")]
     provenance = json.loads((pacific / "provenance.json").read_text())
-    assert {step["stage"] for step in provenance["steps"]} == {"derive-components"}
+    made = provenance["predicate"]["runDetails"]["byproducts"]
+    assert {step["annotations"]["stage"] for step in made} == {"derive-components"}
 
 
 def test_commands_take_such_a_release(tropics, tmp_path, capsys):

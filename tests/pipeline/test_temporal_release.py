@@ -131,7 +131,8 @@ def test_inputs_provenance_and_pictures_are_listed(built: Built, release: Releas
     roles = [i.role for i in release.manifest.inputs]
     assert roles == ["survey"] + 4 * ["observatory"] + 2 * ["index"]
     provenance = json.loads(release.file("provenance.json"))
-    stages = [step["stage"] for step in provenance["steps"]]
+    made = provenance["predicate"]["runDetails"]["byproducts"]
+    stages = [step["annotations"]["stage"] for step in made]
     for stage in ("ingest-index", "ingest-observatory", "check-observatory",
                   "quiet-day-baseline", "fit-fogm", "assemble-temporal"):  # fmt: skip
         assert stage in stages

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from synthetic_release import World, small_lattice
+from synthetic_release import World, made_in_a_test, small_lattice
 
 from magtiles.catalog import open_release
 from magtiles.catalog.releases.digest import canonical_json
@@ -124,7 +124,7 @@ def test_dates_come_from_source_date_epoch_only(
 def test_publishing_again_changes_nothing(world: World, tiles: list[Path], tmp_path: Path) -> None:
     path = world.publish(tmp_path, tiles=tiles).path
     before = {p: p.stat().st_mtime_ns for p in (tmp_path / "demo").rglob("*")}
-    again = world.publish(tmp_path, tiles=tiles, provenance={"made": "on another day"})
+    again = world.publish(tmp_path, tiles=tiles, provenance=made_in_a_test(day="another"))
     assert (again.path, again.changed) == (path, False)
     after = {p: p.stat().st_mtime_ns for p in (tmp_path / "demo").rglob("*")}
     assert after == before

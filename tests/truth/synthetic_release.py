@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from magtiles.catalog.kernels.dipole import dipole_field_geodetic, geodetic_to_ecef
 from magtiles.catalog.releases.lattice import Lattice
 from magtiles.catalog.releases.tile_table import TILE_VARIABLES
+from magtiles.stages.release.provenance import resource, slsa_predicate
 from magtiles.stages.release.publish import PublishResult, publish_release
 from magtiles.stages.release.tile_file import write_tile
 
@@ -138,12 +139,23 @@ class World:
         arguments: dict[str, Any] = {
             "product": "demo", "version": version, "identity": {},
             "inputs": [{"id": "dipoles", "sha256": "0" * 64, "licence": "CC0", "role": "grid"}],
-            "provenance": {"made": "in a test"}, "extra_files": {},
+            "provenance": made_in_a_test(), "extra_files": {},
         }  # fmt: skip
         arguments |= changes
         if "tiles" not in arguments:
             arguments["tiles"] = self.write_tiles(store / "work")
         return publish_release(store, **arguments)
+
+
+def made_in_a_test(**internal: Any) -> dict[str, Any]:
+    """A provenance that claims as little as it may."""
+    return slsa_predicate(
+        parameters={"product": resource("test.toml", None), "sources": [resource("dipoles", None)]},
+        internal=internal,
+        inputs=[{"id": "dipoles", "sha256": "0" * 64, "licence": "CC0", "role": "grid"}],
+        packages={},
+        byproducts=[],
+    )
 
 
 def attributes(name: str) -> dict[str, Any]:
