@@ -21,16 +21,30 @@ from magtiles.pipeline.commands import (
     build,
     diff,
     info,
+    keygen,
     plot,
     query,
     run,
     sample,
+    sign,
     stages,
     validate,
 )
 from magtiles.schemas.errors import MagtilesError, UsageError
 
-COMMANDS: tuple[ModuleType, ...] = (build, validate, diff, info, query, plot, sample, stages, run)
+COMMANDS: tuple[ModuleType, ...] = (
+    build,
+    validate,
+    diff,
+    info,
+    query,
+    plot,
+    keygen,
+    sign,
+    sample,
+    stages,
+    run,
+)
 """Each offers HELP, NEEDS_PIPELINE, add_arguments(parser) and run(arguments) -> exit status."""
 
 BAD_DATA, BAD_USE, INTERRUPTED, BROKEN_PIPE = 1, 2, 130, 141
@@ -54,6 +68,7 @@ _EXTRA = (
     "rasterio",
     "rich",
     "scipy",
+    "verde",
     "xarray",
     "zstandard",
 )

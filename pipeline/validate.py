@@ -14,8 +14,17 @@ from magtiles.catalog import open_release
 from magtiles.catalog.flags import QualityFlag
 from magtiles.catalog.kernels.bspline import HALO
 from magtiles.catalog.releases.digest import array_digest
-from magtiles.catalog.releases.folder import check_folder, read_verified
-from magtiles.catalog.releases.manifest import MANIFEST_NAME, Manifest, TileRecord, read_manifest
+from magtiles.catalog.releases.folder import check_folder, read_bytes, read_verified
+from magtiles.catalog.releases.manifest import (
+    MANIFEST_NAME,
+    MAX_MANIFEST_BYTES,
+    SIGNATURE_NAME,
+    UNLISTED,
+    Manifest,
+    TileRecord,
+    read_manifest,
+)
+from magtiles.catalog.releases.signature import PublicKey, check_signature, read_public_key
 from magtiles.catalog.releases.store import read_tile
 from magtiles.catalog.releases.tile import TileData
 from magtiles.catalog.releases.tile_table import LEVELS, UNITS
@@ -47,8 +56,12 @@ class Check:
     where: str
 
 
-def validate_release(folder: Path) -> list[Check]:
+def validate_release(
+    folder: Path, *, public_key: Path | None = None, require_signature: bool = False
+) -> list[Check]:
     """Run every check on a release; what cannot be read makes checks fail, not stop.
+
+    With a public key its signature is checked, which may be missing unless it is required.
 
     Returns
     -------
@@ -60,6 +73,11 @@ def validate_release(folder: Path) -> list[Check]:
     except MagtilesError as problem:
         return [Check("manifest", False, None, None, "", str(problem))]
     checks = [_attempt("manifest", lambda: _check_manifest(manifest))]
+    if public_key is not None:
+        key = read_public_key(public_key)
+        checks.append(
+            _attempt("signature", lambda: _check_signature(folder, key, require_signature))
+        )
     checks.append(_attempt("files", lambda: _check_files(folder, manifest)))
     checks.append(_check_digests(folder, manifest))
     checks.append(_check_units(manifest))
@@ -82,9 +100,17 @@ def _check_manifest(manifest: Manifest) -> str:
     return f"keeps {contracts.resolve('release-manifest/1')}"
 
 
+def _check_signature(folder: Path, key: PublicKey, required: bool) -> str:
+    data = read_bytes(folder / MANIFEST_NAME, limit=MAX_MANIFEST_BYTES)
+    found = check_signature(data, folder / SIGNATURE_NAME, key, required=required)
+    if found is None:
+        return "there is none"
+    return f"by key {key.name}: {' '.join(found.trusted_comment.split())}"
+
+
 def _check_files(folder: Path, manifest: Manifest) -> str:
     sizes = {file.path: file.size for file in manifest.files}
-    check_folder(folder, sizes, {MANIFEST_NAME})
+    check_folder(folder, sizes, UNLISTED)
     return f"{len(sizes)} files, none missing, none foreign"
 
 

@@ -25,6 +25,9 @@ from magtiles.schemas.errors import IntegrityError
 
 CONTRACT = "release-manifest/1.0.0"
 MANIFEST_NAME = "manifest.json"
+SIGNATURE_NAME = "manifest.json.minisig"
+UNLISTED = frozenset({MANIFEST_NAME, SIGNATURE_NAME})
+"""Files of a release that its manifest does not list; the signature may be missing."""
 ROLES = ("tile", "temporal", "checks", "provenance", "preview", "core_field")
 HEIGHT_REFERENCES = ("ellipsoid", "mean_sea_level", "terrain")
 
@@ -269,7 +272,7 @@ def _check_files(manifest: Manifest, top: Fields) -> None:
     paths = [file.path for file in manifest.files]
     if len({path.lower() for path in paths}) != len(paths):
         raise top.problem("files", "name a path twice", "each path once")
-    if any(path != posixpath.normpath(path) or path == MANIFEST_NAME for path in paths):
+    if any(path != posixpath.normpath(path) or path in UNLISTED for path in paths):
         raise top.problem("files", "hold an unsafe path", "plain paths inside the release")
     if any((file.role == "temporal") != (file.path == TEMPORAL_PATH) for file in manifest.files):
         raise top.problem("files", "have a temporal model elsewhere", f"it at {TEMPORAL_PATH}")

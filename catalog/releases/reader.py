@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterator
 from functools import cached_property
@@ -9,13 +10,23 @@ from pathlib import Path
 from typing import Any
 
 from magtiles.catalog.releases.expected import ReleaseAnomaly, core_field
-from magtiles.catalog.releases.folder import check_folder, read_verified
-from magtiles.catalog.releases.manifest import MANIFEST_NAME, Manifest, read_manifest
+from magtiles.catalog.releases.folder import check_folder, read_bytes, read_verified
+from magtiles.catalog.releases.manifest import (
+    MANIFEST_NAME,
+    MAX_MANIFEST_BYTES,
+    SIGNATURE_NAME,
+    UNLISTED,
+    Manifest,
+    parse_manifest,
+)
+from magtiles.catalog.releases.signature import check_signature, read_public_key
 from magtiles.catalog.releases.store import DEFAULT_CACHE_BYTES, TileStore
 from magtiles.catalog.releases.temporal import TemporalModel
 from magtiles.catalog.releases.temporal_file import read_temporal
 from magtiles.catalog.releases.tile import TileData
-from magtiles.schemas.errors import IntegrityError, QueryError
+from magtiles.schemas.errors import IntegrityError, QueryError, UsageError
+
+_LOG = logging.getLogger(__name__)
 
 
 class Release:
@@ -83,6 +94,8 @@ def open_release(
     *,
     allow_extrapolated: bool = False,
     cache_bytes: int = DEFAULT_CACHE_BYTES,
+    public_key: str | os.PathLike[str] | None = None,
+    require_signature: bool = False,
 ) -> Release:
     """Open a release folder, ``<store>/<product>/<version>``.
 
@@ -95,10 +108,15 @@ def open_release(
     allow_extrapolated : answer with numbers, not NaN, where the map is beyond its coverage.
     cache_bytes : memory for tiles and their splines; least recently used tiles go first, and
         one tile is always kept.
+    public_key : file of the publisher's minisign key; a wrong signature is then refused (this
+        needs the package cryptography).
+    require_signature : refuse a release without a signature, too.
 
     Raises
     ------
-    IntegrityError : the release is not what its manifest says, or is no release.
+    IntegrityError : the release is not what its manifest says, is no release, or not signed.
+    FormatError : the file of the public key holds none.
+    UsageError : a signature is required without a key, or cryptography is not installed.
     """
     folder = Path(path)
     if not (folder / MANIFEST_NAME).is_file():
@@ -106,6 +124,23 @@ def open_release(
             "is no release", where=folder, expected=f"a folder with {MANIFEST_NAME}",
             remedy="give <store>/<product>/<version>",
         )  # fmt: skip
-    manifest = read_manifest(folder)
-    check_folder(folder, {file.path: file.size for file in manifest.files}, {MANIFEST_NAME})
+    manifest = _read_manifest(folder, public_key, require_signature)
+    check_folder(folder, {file.path: file.size for file in manifest.files}, UNLISTED)
     return Release(folder, manifest, allow_extrapolated, cache_bytes)
+
+
+def _read_manifest(
+    folder: Path, public_key: str | os.PathLike[str] | None, required: bool
+) -> Manifest:
+    """Read the manifest, whose very bytes are proven to be signed where a key is given."""
+    where = folder / MANIFEST_NAME
+    data = read_bytes(where, limit=MAX_MANIFEST_BYTES)
+    if public_key is not None:
+        key = read_public_key(Path(public_key))
+        if check_signature(data, folder / SIGNATURE_NAME, key, required=required) is None:
+            _LOG.warning("%s is not signed", folder)
+    elif required:
+        raise UsageError(
+            "a signature is required, but no public key given", remedy="give public_key"
+        )
+    return parse_manifest(data, where)

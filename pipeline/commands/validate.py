@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from magtiles.pipeline.output import print_json, print_table
+from magtiles.schemas.errors import UsageError
 
 if TYPE_CHECKING:
     from magtiles.pipeline.validate import Check
@@ -19,6 +20,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``magtiles validate``."""
     parser.add_argument("release", type=Path, metavar="RELEASE", help="folder of a release")
     parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument(
+        "--public-key", type=Path, metavar="FILE.pub", help="the publisher's minisign key"
+    )
+    parser.add_argument(
+        "--require-signature", action="store_true", help="fail where the release is not signed"
+    )
     parser.add_argument("--junit", type=Path, metavar="FILE.xml", help="write JUnit XML too")
 
 
@@ -26,7 +33,13 @@ def run(arguments: argparse.Namespace) -> int:
     """Print every check; status 1 when any fails."""
     from magtiles.pipeline.validate import validate_release
 
-    checks = validate_release(arguments.release)
+    if arguments.require_signature and arguments.public_key is None:
+        raise UsageError("--require-signature is given without --public-key FILE.pub")
+    checks = validate_release(
+        arguments.release,
+        public_key=arguments.public_key,
+        require_signature=arguments.require_signature,
+    )
     passed = all(check.passed for check in checks)
     if arguments.junit is not None:
         from magtiles.pipeline.junit import write_junit
