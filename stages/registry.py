@@ -14,12 +14,14 @@ from magtiles.stages.field import (
     rereference,
     voids,
 )
+from magtiles.stages.field.survey import grid as survey_grid
 from magtiles.stages.ingest import grid, index
 from magtiles.stages.ingest.log import stage as log
 from magtiles.stages.ingest.observatory import stage as observatory
 from magtiles.stages.release import expect_total, tiles
 from magtiles.stages.road import resample
 from magtiles.stages.temporal import assemble, baseline, check, diurnal, fit_fogm
+from magtiles.stages.vehicle import align
 from magtiles.stages.vehicle.calibration import apply as apply_calibration
 from magtiles.stages.vehicle.calibration import calibrate
 from magtiles.stages.vehicle.tolles_lawson import apply as apply_tolles_lawson
@@ -30,6 +32,7 @@ STAGES: tuple[Stage, ...] = (
     observatory.STAGE,
     index.STAGE,
     log.STAGE,
+    align.STAGE,
     calibrate.STAGE,
     apply_calibration.STAGE,
     expect_total.STAGE,
@@ -46,6 +49,7 @@ STAGES: tuple[Stage, ...] = (
     assemble.STAGE,
     diurnal.RECORD_STAGE,
     diurnal.BASELINE_STAGE,
+    survey_grid.STAGE,
     crop.STAGE,
     voids.STAGE,
     carry_forward.STAGE,

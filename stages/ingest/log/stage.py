@@ -326,6 +326,9 @@ class _Assembly:
         }
         if params.lever_arm_m is not None:
             attrs["lever_arm_m"] = list(params.lever_arm_m)
+        turn = rotation(params.sensor_to_body)
+        if turn is not None and self.raw.samples.values.ndim == 2:
+            attrs["sensor_to_body"] = [float(value) for value in turn.ravel()]
         if self.raw.samples.sigma is not None:
             factor = _factor(self.raw.samples, params, self.where)
             attrs["field_sigma_nt"] = [float(s) for s in self.raw.samples.sigma * factor]
