@@ -104,19 +104,20 @@ def magnetic_field(
 
 
 def nav_sat_fix(
-    name: str, time: Times, place: Floats, *, sigma_m: ArrayLike, delay_s: float = 0.08
+    name: str, time: Times, place: Floats, *, sigma_m: ArrayLike | None, delay_s: float = 0.08
 ) -> Topic:
     """Fixes (n, 3): latitude, longitude, degrees, and height above the ellipsoid, m.
 
-    `sigma_m` is 1 sigma toward east, north and up, (3,) or (n, 3).
+    `sigma_m` is 1 sigma toward east, north and up, (3,) or (n, 3); None where it is not known.
     """
-    covariance = _covariance(len(time), np.square(sigma_m))
+    known = sigma_m is not None
+    covariance = _covariance(len(time), 0.0 if sigma_m is None else np.square(sigma_m))
     fields = {
         "status": np.zeros(len(time), "i1"),
         "service": np.ones(len(time), "<u2"),  # GPS
         "place": place,
         "covariance": covariance,
-        "covariance_type": np.full(len(time), 2, "u1"),  # the diagonal is known
+        "covariance_type": np.full(len(time), 2 if known else 0, "u1"),  # the diagonal, or nothing
     }
     return _topic(name, "sensor_msgs/msg/NavSatFix", time, delay_s, "gnss_link", fields)
 
