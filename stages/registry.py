@@ -21,7 +21,7 @@ from magtiles.stages.ingest.observatory import stage as observatory
 from magtiles.stages.release import expect_total, tiles
 from magtiles.stages.road import resample
 from magtiles.stages.temporal import assemble, baseline, check, diurnal, fit_fogm
-from magtiles.stages.vehicle import align
+from magtiles.stages.vehicle import align, reduce
 from magtiles.stages.vehicle.calibration import apply as apply_calibration
 from magtiles.stages.vehicle.calibration import calibrate
 from magtiles.stages.vehicle.tolles_lawson import apply as apply_tolles_lawson
@@ -49,6 +49,7 @@ STAGES: tuple[Stage, ...] = (
     assemble.STAGE,
     diurnal.RECORD_STAGE,
     diurnal.BASELINE_STAGE,
+    reduce.STAGE,
     survey_grid.STAGE,
     crop.STAGE,
     voids.STAGE,

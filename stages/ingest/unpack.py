@@ -23,7 +23,7 @@ class _Readable(Protocol):
 _LIMIT_BYTES = 16 << 30
 _BLOCK_BYTES = 1 << 20
 _PACKED = {b"\x1f\x8b": "gzip", b"\xfd7zXZ\x00": "xz", b"PK\x03\x04": "zip"}
-_OPEN = {"gzip": (gzip.open, ".gz"), "xz": (lzma.open, ".xz")}
+_SUFFIX = {"gzip": ".gz", "xz": ".xz"}
 
 
 @contextlib.contextmanager
@@ -72,9 +72,8 @@ def _kind(path: Path) -> str | None:
 
 
 def _expand(kind: str, path: Path, folder: Path) -> Path:
-    opener, suffix = _OPEN[kind]
-    out = folder / (path.stem if path.suffix.lower() == suffix else path.name)
-    with opener(path) as packed:
+    out = folder / (path.stem if path.suffix.lower() == _SUFFIX[kind] else path.name)
+    with gzip.open(path) if kind == "gzip" else lzma.open(path) as packed:
         _copy(packed, out, path)
     return out
 

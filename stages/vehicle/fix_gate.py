@@ -99,4 +99,5 @@ def stationary(way: Way, at: Real, *, speed: float, window_s: float) -> NDArray[
     # At either end the first and last whole window.
     middle = np.clip(at, way.seconds[0] + half, way.seconds[-1] - half)
     inside = (at >= way.seconds[0]) & (at <= way.seconds[-1])
-    return inside & (np.linalg.norm(way.chord(middle, half), axis=1) < speed)
+    slow: NDArray[np.bool_] = np.linalg.norm(way.chord(middle, half), axis=1) < speed
+    return inside & slow

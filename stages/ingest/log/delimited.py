@@ -96,7 +96,7 @@ def _check_fields(lines: Lines, separator: str, expected: int) -> Lines:
 
 def _values(column: pd.Series, no_data: float | None) -> NDArray[np.generic]:
     if column.dtype.kind in "biuf":
-        numbers = column.to_numpy(dtype=np.float64, copy=True)
+        numbers = np.array(column, dtype=np.float64)
         if no_data is not None:
             numbers[numbers == no_data] = np.nan
         return numbers
