@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import posixpath
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,6 +20,7 @@ from magtiles.catalog.releases.digest import manifest_digest
 from magtiles.catalog.releases.fields import REMEDY, Fields, parse_json
 from magtiles.catalog.releases.folder import read_bytes
 from magtiles.catalog.releases.lattice import Lattice
+from magtiles.catalog.releases.road_table import PATH as ROAD_PATH
 from magtiles.catalog.releases.temporal_table import PATH as TEMPORAL_PATH
 from magtiles.catalog.releases.tile_table import TILE_VARIABLES
 from magtiles.schemas.errors import IntegrityError
@@ -28,7 +30,7 @@ MANIFEST_NAME = "manifest.json"
 SIGNATURE_NAME = "manifest.json.minisig"
 UNLISTED = frozenset({MANIFEST_NAME, SIGNATURE_NAME})
 """Files of a release that its manifest does not list; the signature may be missing."""
-ROLES = ("tile", "temporal", "checks", "provenance", "preview", "core_field")
+ROLES = ("tile", "temporal", "road", "checks", "provenance", "preview", "core_field")
 HEIGHT_REFERENCES = ("ellipsoid", "mean_sea_level", "terrain")
 
 MAX_MANIFEST_BYTES = 256 << 20
@@ -84,6 +86,21 @@ class TemporalRecord(FileRecord):
 
 
 @dataclass(frozen=True)
+class RoadRecord(FileRecord):
+    """A road map: the digest of its arrays, where it lies, its length and spacing in metres."""
+
+    array_digest: str
+    bounds: Mapping[str, tuple[float, float]]
+    length_m: float
+    spacing_m: float
+
+    @property
+    def name(self) -> str:
+        """What the reader knows it by: the name of its file."""
+        return posixpath.basename(self.path).removesuffix(".nc")
+
+
+@dataclass(frozen=True)
 class InputRecord:
     """A source the release was made from."""
 
@@ -119,6 +136,11 @@ class Manifest:
     def temporal(self) -> TemporalRecord | None:
         """The temporal model's record; None where the release has none."""
         return next((f for f in self.files if isinstance(f, TemporalRecord)), None)
+
+    @cached_property
+    def roads(self) -> Mapping[str, RoadRecord]:
+        """Road maps by name."""
+        return {f.name: f for f in self.files if isinstance(f, RoadRecord)}
 
     @cached_property
     def has_reference_surface(self) -> bool:
@@ -220,6 +242,15 @@ def _file(fields: Fields, lattice: Lattice, levels: int) -> FileRecord:
     if role == "temporal":
         fields.only(*TemporalRecord.__dataclass_fields__)
         return TemporalRecord(**base, array_digest=fields.text("array_digest", _SHA256))
+    if role == "road":
+        fields.only(*RoadRecord.__dataclass_fields__)
+        return RoadRecord(
+            **base,
+            array_digest=fields.text("array_digest", _SHA256),
+            bounds=_bounds(fields.inner("bounds")),
+            length_m=fields.number("length_m", 0, 1e9),
+            spacing_m=fields.number("spacing_m", 1e-3, 1e6),
+        )
     if role != "tile":
         fields.only(*base)
         return FileRecord(**base)
@@ -276,6 +307,8 @@ def _check_files(manifest: Manifest, top: Fields) -> None:
         raise top.problem("files", "hold an unsafe path", "plain paths inside the release")
     if any((file.role == "temporal") != (file.path == TEMPORAL_PATH) for file in manifest.files):
         raise top.problem("files", "have a temporal model elsewhere", f"it at {TEMPORAL_PATH}")
+    if any((f.role == "road") != bool(re.fullmatch(ROAD_PATH, f.path)) for f in manifest.files):
+        raise top.problem("files", "have a road map elsewhere", "them at roads/<name>.nc")
     if any(path.split("/")[0] in paths for path in paths if "/" in path):
         raise top.problem("files", "use a file as a folder", "plain paths inside the release")
     rows, columns = manifest.lattice.shape

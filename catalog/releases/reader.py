@@ -7,7 +7,6 @@ import os
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 from magtiles.catalog.releases.expected import ReleaseAnomaly, core_field
 from magtiles.catalog.releases.folder import check_folder, read_bytes, read_verified
@@ -19,6 +18,7 @@ from magtiles.catalog.releases.manifest import (
     Manifest,
     parse_manifest,
 )
+from magtiles.catalog.releases.roads import Roads
 from magtiles.catalog.releases.signature import check_signature, read_public_key
 from magtiles.catalog.releases.store import DEFAULT_CACHE_BYTES, TileStore
 from magtiles.catalog.releases.temporal import TemporalModel
@@ -64,10 +64,15 @@ class Release:
             allow_extrapolated=self._extrapolate,
         )
 
-    @property
-    def roads(self) -> Any:
-        """Maps of roads by name; raises QueryError when the release has none."""
-        raise self._lacks("road maps")
+    @cached_property
+    def roads(self) -> Roads:
+        """Maps of roads by name, each verified when it is first asked for.
+
+        Raises QueryError when the release has none.
+        """
+        if not self.manifest.roads:
+            raise self._lacks("road maps")
+        return Roads(self.path, self.manifest, self.file, self._store.lock)
 
     def tiles(self) -> Iterator[TileData]:
         """Every tile, whole: size, sha256, contract and lattice verified. IntegrityError."""

@@ -12,6 +12,7 @@ from magtiles.catalog.releases.manifest import (
     VERSION,
     FileRecord,
     Manifest,
+    RoadRecord,
     TemporalRecord,
     TileRecord,
 )
@@ -121,6 +122,11 @@ def _new_values(old: Manifest, new: Manifest) -> Iterable[str]:
     digests = _temporal_digest(old), _temporal_digest(new)
     if digests[0] != digests[1]:
         yield f"the temporal model {'came or went' if None in digests else 'changed'}"
+    for name in sorted(set(old.roads) | set(new.roads)):
+        if name not in old.roads or name not in new.roads:
+            yield f"road {name} came or went"
+        elif old.roads[name].array_digest != new.roads[name].array_digest:
+            yield f"arrays changed in {new.roads[name].path}"
     before, after = _content(old, "core_field"), _content(new, "core_field")
     if before != after:
         yield "the core field's coefficients changed"
@@ -133,7 +139,7 @@ def _new_description(old: Manifest, new: Manifest) -> Iterable[str]:
         if path not in before or path not in after:
             yield f"{path} came or went"
         elif before[path].sha256 != after[path].sha256:
-            arrays = isinstance(after[path], (TileRecord, TemporalRecord))
+            arrays = isinstance(after[path], (TileRecord, TemporalRecord, RoadRecord))
             same = ", its arrays did not" if arrays else ""
             yield f"{path} changed{same}"
     if old.inputs != new.inputs:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,11 +13,7 @@ from magtiles.catalog.releases.fields import Fields, parse_json
 from magtiles.catalog.releases.manifest import Manifest
 from magtiles.catalog.releases.reader import Release
 from magtiles.schemas.errors import IntegrityError
-from magtiles.stages.release.checks_temporal import (
-    UNITS,
-    temporal_answers,
-    temporal_positions,
-)
+from magtiles.stages.release import checks_roads, checks_temporal
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -60,13 +57,24 @@ def make_checks(release: Release) -> dict[str, Any]:
         "expected": {name: _plain(v) for name, v in _answers(release, positions).items()},
     }
     if release.manifest.temporal is not None:
-        at = temporal_positions(release)
-        document["temporal"] = {
-            "units": UNITS,
-            "positions": {name: _plain(values) for name, values in at.items()},
-            "expected": {name: _plain(v) for name, v in temporal_answers(release, at).items()},
-        }
+        at = checks_temporal.temporal_positions(release)
+        answers = checks_temporal.temporal_answers(release, at)
+        document["temporal"] = _section(checks_temporal.UNITS, at, answers)
+    if release.manifest.roads:
+        document["roads"] = {}
+    for name in sorted(release.manifest.roads):
+        at = checks_roads.road_positions(release, name)
+        answers = checks_roads.road_answers(release, name, at)
+        document["roads"][name] = _section(checks_roads.UNITS, at, answers)
     return document
+
+
+def _section(units: Mapping[str, str], at: Arrays, answers: Arrays) -> dict[str, Any]:
+    return {
+        "units": dict(units),
+        "positions": {name: _plain(values) for name, values in at.items()},
+        "expected": {name: _plain(values) for name, values in answers.items()},
+    }
 
 
 def replay_checks(release: Release) -> float:
@@ -79,7 +87,12 @@ def replay_checks(release: Release) -> float:
     worst = _replay(document, lambda at: _answers(release, at), where)
     if release.manifest.temporal is not None:
         temporal = document.inner("temporal")
-        worst = max(worst, _replay(temporal, lambda at: temporal_answers(release, at), where))
+        ask = partial(checks_temporal.temporal_answers, release)
+        worst = max(worst, _replay(temporal, ask, where))
+    for name in sorted(release.manifest.roads):
+        road = document.inner("roads").inner(name)
+        ask = partial(checks_roads.road_answers, release, name)
+        worst = max(worst, _replay(road, ask, where))
     return worst
 
 

@@ -24,6 +24,7 @@ from magtiles.catalog.releases.manifest import (
     read_manifest,
 )
 from magtiles.catalog.releases.reader import open_release
+from magtiles.catalog.releases.road_table import PATH as ROAD_PATH
 from magtiles.catalog.releases.temporal_table import PATH as TEMPORAL_PATH
 from magtiles.catalog.releases.tile_table import UNITS
 from magtiles.catalog.releases.versions import (
@@ -44,6 +45,7 @@ from magtiles.stages.release.records import (
     common_lattice,
     measure_tile,
 )
+from magtiles.stages.release.road_file import measure_road
 from magtiles.stages.release.temporal_file import measure_temporal
 
 LATEST_NAME = "latest.json"
@@ -54,6 +56,7 @@ _EXTRA_ROLES = {
     r"preview/[A-Za-z0-9_-][A-Za-z0-9._-]*": "preview",
     r"core_field\.shc": "core_field",
     r"temporal\.nc": "temporal",
+    ROAD_PATH: "road",
 }
 _DATUM = "WGS84"
 
@@ -87,8 +90,9 @@ def publish_release(
         a value that contradicts the tiles raises ContractError.
     inputs : the sources, each with the keys id, sha256, licence and role.
     provenance : how it was made, as `slsa_predicate` says it.
-    extra_files : ``preview/*``, ``core_field.shc`` and ``temporal.nc`` (as `write_temporal`
-        makes it, and with a core field), path in the release to file.
+    extra_files : ``preview/*``, ``core_field.shc``, ``temporal.nc`` (as `write_temporal` makes
+        it, and with a core field) and ``roads/*.nc`` (as `write_road` makes them, at
+        `road_path`), path in the release to file.
 
     Returns
     -------
@@ -113,6 +117,8 @@ def publish_release(
     _add_files(document, extras)
     if TEMPORAL_PATH in extra_files:
         _add_temporal(document, extra_files)
+    for path in (path for path in extra_files if re.fullmatch(ROAD_PATH, path)):
+        _complete_entry(document, measure_road(extra_files[path], path), extra_files[path])
     changed = not _exists_already(home, _sealed(document))
     if changed:
         _build(home, final, document, measured, extras, provenance)
@@ -200,7 +206,7 @@ def _extra(path: str, file: Path) -> bytes:
         raise ContractError(
             "has no place in a release",
             where=path,
-            expected=f"preview/<name>, core_field.shc or {TEMPORAL_PATH}",
+            expected=f"preview/<name>, core_field.shc, {TEMPORAL_PATH} or roads/<name>.nc",
         )
     return file.read_bytes()
 
@@ -229,11 +235,14 @@ def _add_temporal(document: dict[str, Any], extra_files: Mapping[str, Path]) -> 
             remedy="name a reference field whose coefficients are at hand, such as IGRF-14",
         )
     record = measure_temporal(extra_files[TEMPORAL_PATH])
-    plain = next(file for file in document["files"] if file["path"] == TEMPORAL_PATH)
+    _complete_entry(document, record, extra_files[TEMPORAL_PATH])
+
+
+def _complete_entry(document: dict[str, Any], record: dict[str, Any], file: Path) -> None:
+    """Replace the plain entry of a file by its whole record."""
+    plain = next(entry for entry in document["files"] if entry["path"] == record["path"])
     if plain["sha256"] != record["sha256"]:
-        raise ContractError(
-            "changed while it was being published", where=extra_files[TEMPORAL_PATH]
-        )
+        raise ContractError("changed while it was being published", where=file)
     plain |= record
 
 
