@@ -255,7 +255,7 @@ def _locate(
 def _foot(
     nodes: Floats, best: int, y: float, x: float, north: float, east: float
 ) -> tuple[int, float, float]:
-    """Nearest place on the two lines at a point: start of the line, share of it, distance squared."""
+    """Nearest place on the two lines at a point: start of the line, share, distance squared."""
     start, share, least = np.int64(best), 0.0, math.inf
     for j in range(np.uint64(max(best - 1, 0)), np.uint64(min(best + 1, nodes.shape[0] - 1))):
         k = j + np.uint64(1)
