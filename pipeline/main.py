@@ -20,6 +20,7 @@ from types import ModuleType
 from magtiles.pipeline.commands import (
     build,
     diff,
+    export,
     info,
     keygen,
     plot,
@@ -41,6 +42,7 @@ COMMANDS: tuple[ModuleType, ...] = (
     plot,
     keygen,
     sign,
+    export,
     sample,
     stages,
     run,
