@@ -12,14 +12,16 @@ from magtiles.stages.field import (
     evaluate_model,
     model_components,
     rereference,
+    surface,
     voids,
 )
 from magtiles.stages.field.survey import grid as survey_grid
 from magtiles.stages.ingest import grid, index
+from magtiles.stages.ingest import surface as ingest_surface
 from magtiles.stages.ingest.log import stage as log
 from magtiles.stages.ingest.observatory import stage as observatory
 from magtiles.stages.release import expect_total, tiles
-from magtiles.stages.road import resample
+from magtiles.stages.road import features, merge, resample
 from magtiles.stages.temporal import assemble, baseline, check, diurnal, fit_fogm
 from magtiles.stages.vehicle import align, reduce
 from magtiles.stages.vehicle.calibration import apply as apply_calibration
@@ -29,6 +31,7 @@ from magtiles.stages.vehicle.tolles_lawson import fit as fit_tolles_lawson
 
 STAGES: tuple[Stage, ...] = (
     grid.STAGE,
+    ingest_surface.STAGE,
     observatory.STAGE,
     index.STAGE,
     log.STAGE,
@@ -39,6 +42,8 @@ STAGES: tuple[Stage, ...] = (
     fit_tolles_lawson.STAGE,
     apply_tolles_lawson.STAGE,
     resample.STAGE,
+    merge.STAGE,
+    features.STAGE,
     evaluate_model.STAGE,
     core_field.GRID_STAGE,
     core_field.TRACK_STAGE,
@@ -57,6 +62,7 @@ STAGES: tuple[Stage, ...] = (
     continuation.STAGE,
     components.STAGE,
     model_components.STAGE,
+    surface.STAGE,
     tiles.STAGE,
 )
 """In the order of the work: ingest, field, release."""

@@ -83,8 +83,13 @@ class Merged:
 
 @dataclass(frozen=True)
 class Aligned:
-    """A pass at the points of a map: field (point, 3), place (point, 2), along (point, 4),
-    `row` (point,) the pass's nearest point, and where (point,) it has a field.
+    """A pass at the points of a map.
+
+    Attributes
+    ----------
+    field, place, along : (point, 3), (point, 2), (point, 4) as in `Merged`.
+    row : (point,) the pass's nearest point.
+    where : (point,) whether the pass has a field there.
     """
 
     field: Real

@@ -24,8 +24,8 @@ _TURN_M = 30.0
 _U_TURN_DEG = 150.0
 _U_TURN_M = 60.0
 _PARALLEL_DEG = 30.0
-_APART_M = 100.0
-"""Driven between two visits of one place, at least."""
+_APART_WIDTHS = 3.0
+"""Widths of the road driven between two visits of one place, at least."""
 _SHORTEST_M = 25.0
 """Of a part; what is shorter lies within a junction."""
 _SHARED = 0.8
@@ -115,7 +115,7 @@ class _Shape:
 def _parts(motion: Motion, track: xr.Dataset, params: SplitParams) -> list[DrivePart]:
     shape = _shape(motion, track)
     lost = _gaps(motion, track, params)
-    cuts = np.concatenate([_turns(shape, params), _visits(shape, params)])
+    cuts = _merged(np.concatenate([_turns(shape, params), _visits(shape, params)]), params)
     ends = np.concatenate([[shape.distance[0], shape.distance[-1]], lost.ravel()])
     bounds = np.unique(np.concatenate([ends, cuts]))
     pieces = [
@@ -149,6 +149,7 @@ def _gaps(motion: Motion, track: xr.Dataset, params: SplitParams) -> Real:
     known &= motion.at(seconds, motion.doubtful.astype(np.float64)) == 0.0
     at = motion.at(seconds[known], motion.distance)
     at = np.concatenate([[0.0], at[np.isfinite(at)], motion.distance[-1:]])
+    at = np.sort(at)
     wide = np.flatnonzero(np.diff(at) > params.max_gap_m)
     return np.column_stack([at[wide], at[wide + 1]])
 
@@ -183,7 +184,9 @@ def _visits(shape: _Shape, params: SplitParams) -> Real:
     pairs = cKDTree(shape.place).query_pairs(params.road_width_m, output_type="ndarray")
     if pairs.size == 0:
         return np.empty(0)
-    apart = np.abs(np.diff(shape.distance[pairs], axis=1)[:, 0]) > _APART_M
+    apart = (
+        np.abs(np.diff(shape.distance[pairs], axis=1)[:, 0]) > _APART_WIDTHS * params.road_width_m
+    )
     pairs = pairs[apart]
     turn = np.abs((np.diff(shape.course[pairs], axis=1)[:, 0] + np.pi) % (2 * np.pi) - np.pi)
     line = np.minimum(turn, np.pi - turn) < np.radians(_PARALLEL_DEG)
@@ -193,7 +196,7 @@ def _visits(shape: _Shape, params: SplitParams) -> Real:
     for number in np.unique(pairs[~line].ravel()):
         if not along[number]:
             cuts.append(int(number))
-    return _merged(shape.distance[np.array(sorted(cuts), dtype=np.intp)], params)
+    return shape.distance[np.array(cuts, dtype=np.intp)]
 
 
 def _run_ends(mask: NDArray[np.bool_]) -> NDArray[np.intp]:
@@ -204,6 +207,7 @@ def _merged(at: Real, params: SplitParams) -> Real:
     """The middle of each cluster of cuts closer together than a junction is wide."""
     if at.size == 0:
         return at
+    at = np.sort(at)
     wide = np.flatnonzero(np.diff(at) > 2.0 * params.road_width_m) + 1
     return np.array([run.mean() for run in np.split(at, wide)])
 
@@ -236,7 +240,7 @@ def _same_road(
         shared = max(np.mean(away < params.road_width_m), np.mean(back < params.road_width_m))
         if shared < _SHARED or min(len(place), len(other)) < _SHARED * max(len(place), len(other)):
             continue
-        agree = float(np.mean(np.cos(course - other_course[nearest])))
+        agree = float(np.median(np.cos(course - other_course[nearest])))
         if abs(agree) > np.cos(np.radians(_PARALLEL_DEG)):
             return number, "forward" if agree > 0.0 else "backward"
     return len(firsts), "forward"

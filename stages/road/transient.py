@@ -16,12 +16,12 @@ _SEED = 6.0
 """Standard deviations at which a difference is no scatter, and"""
 _EDGE = 2.5
 """those down to which it belongs to the same disturbance."""
-_LEAST_NT = 500.0
-_APART_M = 0.5
-"""Two passes lie this far apart even when aligned, so that steep fields differ."""
-_NEAR_M = 3.0
-_CALIBRATION = 0.15
-"""Share of a local feature by which vehicles may see it differently."""
+_LEAST_NT = 1000.0
+_APART_M = 1.0
+"""Two passes lie this far apart even when aligned, in lane and place: steep fields differ."""
+_NEAR_M = 5.0
+_CALIBRATION = 0.5
+"""Share of a local feature by which lanes and vehicles may see it differently."""
 _CLEARLY = 3.0
 """Times nearer that one of two passes must be for the other to be dropped."""
 

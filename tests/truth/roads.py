@@ -203,3 +203,16 @@ def _track(
         coords={"time": time},
         attrs={"height_reference": "ellipsoid", "source": f"trip {trip.seed}"},
     )
+
+
+def follow(corners: Real, *, speed_m_s: float = 10.0, noise_m: float = 0.2) -> xr.Dataset:
+    """A track/1 along straight lines between `corners` (n, 2), m, in the core field."""
+    corners = np.asarray(corners, np.float64)
+    legs = np.linalg.norm(np.diff(corners, axis=0), axis=1)
+    bounds = np.concatenate([[0.0], np.cumsum(legs)])
+    seconds = np.arange(0.0, bounds[-1] / speed_m_s, 0.05)
+    place = np.column_stack([np.interp(speed_m_s * seconds, bounds, c) for c in corners.T])
+    step = np.gradient(place, axis=0)
+    reading = turned(np.tile(CORE, (len(place), 1)), np.arctan2(step[:, 1], step[:, 0]))
+    trip = Trip(fix_noise_m=noise_m, fix_drift_m=noise_m)
+    return _track(place, seconds, reading, trip, np.random.default_rng(1))
