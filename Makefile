@@ -24,7 +24,7 @@ export MPLCONFIGDIR := $(CURDIR)/build/matplotlib
 
 .DEFAULT_GOAL := tiles
 .DELETE_ON_ERROR:
-.PHONY: tiles $(RELEASES) test check validate bench wheel-check lock clean help
+.PHONY: tiles $(RELEASES) test check validate report bench wheel-check lock clean help
 
 tiles: $(RELEASES) ## Build and validate PRODUCT="a.toml b.toml" (default: the demo), `-j` for side by side
 	@printf '%s\n' '' 'Releases are in $(STORE). Next, with RELEASE one of them:' \
@@ -56,6 +56,14 @@ validate: $(READY) ## Validate every release under STORE
 	@found=; for manifest in $(STORE)/*/*/manifest.json; do \
 	  [ -e "$$manifest" ] || continue; found=1; \
 	  $(MAGTILES) validate "$${manifest%/manifest.json}" || exit; \
+	done; \
+	[ -n "$$found" ] || { echo 'no release under $(STORE): run make tiles' >&2; exit 1; }
+
+report: $(READY) ## Write one offline HTML page about every release under STORE, to build/reports
+	@found=; for manifest in $(STORE)/*/*/manifest.json; do \
+	  [ -e "$$manifest" ] || continue; found=1; folder=$${manifest%/manifest.json}; \
+	  page=build/reports/$$(basename $${folder%/*})-$$(basename $$folder).html; \
+	  mkdir -p build/reports; $(MAGTILES) report "$$folder" --out "$$page" || exit; \
 	done; \
 	[ -n "$$found" ] || { echo 'no release under $(STORE): run make tiles' >&2; exit 1; }
 
