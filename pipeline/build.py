@@ -12,7 +12,7 @@ from magtiles.catalog.releases.temporal_table import PATH as TEMPORAL_PATH
 from magtiles.pipeline import receipts
 from magtiles.pipeline.cutting import cutting
 from magtiles.pipeline.model_map import plan_model_map
-from magtiles.pipeline.product import ModelMap, Product, load_product
+from magtiles.pipeline.product import ModelMap, Product, SurveyMap, load_product
 from magtiles.pipeline.progress import Progress, silent
 from magtiles.pipeline.steps import MapPlan, Steps
 from magtiles.pipeline.survey_map import plan_survey_map
@@ -79,6 +79,8 @@ def _build(
 ) -> PublishResult:
     folder = work / wanted.product.name
     more = 0 if wanted.temporal is None else wanted.temporal.steps
+    if isinstance(wanted.map, SurveyMap) and wanted.map.surface is not None:
+        more += wanted.map.surface.steps
     steps = Steps(progress, total=4 + len(wanted.map.table.heights_m) + more)
     plan = _plan(wanted, folder, data, steps)
     temporal = None
@@ -91,7 +93,7 @@ def _build(
             levels.append(plan.level(height))
             pictures.append(folder / "preview" / f"{height:.12g}m.png")
             cutter.draw(levels[-1], pictures[-1], wanted.product.name, wanted.product.version)
-        cut = cutter.cut(levels, folder / "tiles", progress)
+        cut = cutter.cut(levels, plan.surface, folder / "tiles", progress)
         cutter.finish_drawing()
     steps.report("publishing")
     return _publish(wanted, store, plan, cut, levels, pictures, temporal)

@@ -24,7 +24,7 @@ _PROCESSES = 2
 _WORTH_PROCESSES = 4_000_000
 """Nodes of all levels above which processes save more time than their start takes."""
 
-_Job = tuple[Sequence[Path], Path, Mapping[str, Any]]
+_Job = tuple[Mapping[str, Any], Path, Mapping[str, Any]]
 
 
 @contextlib.contextmanager
@@ -52,11 +52,14 @@ class Cutter:
     pool: concurrent.futures.Executor | None
     pictures: list[concurrent.futures.Future[None]] = field(default_factory=list)
 
-    def cut(self, levels: Sequence[Path], folder: Path, progress: Progress) -> list[MeasuredTile]:
-        """Cut every tile from the level grids into `folder`, measured."""
+    def cut(
+        self, levels: Sequence[Path], surface: Path | None, folder: Path, progress: Progress
+    ) -> list[MeasuredTile]:
+        """Cut every tile from the level grids and their surface into `folder`, measured."""
         rows, columns = self.lattice.shape
+        inputs = {"grid": levels} | ({} if surface is None else {"surface": surface})
         jobs: list[_Job] = [
-            (levels, folder / f"r{r:03d}c{c:03d}.nc", tiles.tile_params(self.lattice, r, c))
+            (inputs, folder / f"r{r:03d}c{c:03d}.nc", tiles.tile_params(self.lattice, r, c))
             for r in range(rows)
             for c in range(columns)
         ]
@@ -96,8 +99,8 @@ def _start() -> None:
     """Nothing: a process that can run this has loaded what cutting needs."""
 
 
-def _cut_one(levels: Sequence[Path], out: Path, params: Mapping[str, Any]) -> MeasuredTile:
-    made = run_stage(tiles.STAGE, {"grid": levels}, out, params)
+def _cut_one(inputs: Mapping[str, Any], out: Path, params: Mapping[str, Any]) -> MeasuredTile:
+    made = run_stage(tiles.STAGE, inputs, out, params)
     return measure_tile(made.out, made.dataset)
 
 

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 import pydantic
 
 from magtiles.catalog.models.igrf import igrf_files
+from magtiles.pipeline.reference_surface import ReferenceSurface, load_reference_surface
 from magtiles.pipeline.source_paths import find_source
 from magtiles.pipeline.temporal_part import TemporalSources, TemporalTable, load_temporal
 from magtiles.schemas.errors import SourceError
@@ -87,6 +88,12 @@ class AnomalyTable(Params):
     height_reference: Literal["ellipsoid", "mean_sea_level", "terrain"] = quantity(
         "1", doc="What heights count from: the source's."
     )
+    surface: str | None = quantity(
+        "1", default=None, doc="Source TOML of the terrain's height (a DEM), or an id."
+    )
+    geoid: str | None = quantity(
+        "1", default=None, doc="Source TOML of the geoid, for a survey or a DEM above sea level."
+    )
     region: RegionTable | None = quantity("1", default=None, doc="Limits; default all data.")
     spacing_m: float | None = quantity(
         "m",
@@ -158,11 +165,15 @@ class ProductTables(Params):
 
 @dataclass(frozen=True)
 class SurveyMap:
-    """The map of a survey: what is asked of it, its source TOML's path, and that TOML read."""
+    """The map of a survey: what is asked of it, its source TOML's path, and that TOML read.
+
+    `surface` is what its heights count from, where the product says how high that is.
+    """
 
     table: AnomalyTable
     path: Path
     source: Source[IngestGridParams]
+    surface: ReferenceSurface | None = None
 
 
 @dataclass(frozen=True)
@@ -228,7 +239,10 @@ def _survey_map(survey: AnomalyTable, path: Path) -> SurveyMap:
     source_path = find_source(survey.source, path, "anomaly.source")
     source = load_source(source_path, ANOMALY_GRID)
     _check_reference(survey, source, path)
-    return SurveyMap(survey, source_path, source)
+    surface = load_reference_surface(
+        survey.surface, survey.geoid, survey.height_reference, source, path
+    )
+    return SurveyMap(survey, source_path, source, surface)
 
 
 def _model_map(model: ModelTable, product: Path) -> ModelMap:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
+from magtiles.pipeline import receipts
 from magtiles.schemas.errors import SourceError
+from magtiles.stages.ingest.source import Source
 
 
 def find_source(name: str, product: Path, key: str) -> Path:
@@ -32,3 +36,22 @@ def find_source(name: str, product: Path, key: str) -> Path:
         expected="the path of a source TOML, or an id in the catalog",
         remedy="write the path with its .toml",
     )
+
+
+def data_files(source: Source[Any], data: Path | None) -> list[Path]:
+    """A source's data files: in `data` where it is given, else beside the source TOML."""
+    return list(source.files) if data is None else [data / file.name for file in source.files]
+
+
+def manifest_inputs(source: Source[Any], files: Sequence[Path], role: str) -> list[dict[str, str]]:
+    """What a manifest says of a source: each of its data files, with digest and licence."""
+    header = source.source
+    return [
+        {
+            "id": f"{header.id}/{file.name}" if len(files) > 1 else header.id,
+            "sha256": receipts.digest(file),
+            "licence": header.licence,
+            "role": role,
+        }
+        for file in files
+    ]

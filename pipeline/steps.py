@@ -46,6 +46,7 @@ class MapPlan:
     inputs : of the manifest: id, sha256, licence and role of each.
     source : the TOML or coefficient file that the product names.
     core_field : file of the coefficients that the anomaly counts from, if they are at hand.
+    surface : ellipsoidal height of what the heights count from, on the same nodes, if known.
     """
 
     lattice: Lattice
@@ -55,6 +56,7 @@ class MapPlan:
     inputs: Sequence[Mapping[str, str]]
     source: Path
     core_field: Path | None
+    surface: Path | None = None
 
 
 def node_axes(lattice: Lattice) -> dict[str, tuple[float, float, int]]:

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from magtiles.catalog.releases.lattice import Lattice
-from magtiles.pipeline import receipts
 from magtiles.pipeline.artifacts import open_artifact
 from magtiles.pipeline.product import AnomalyTable, SurveyMap
+from magtiles.pipeline.source_paths import data_files, manifest_inputs
 from magtiles.pipeline.steps import MapPlan, Steps, node_axes
-from magtiles.schemas.errors import CoverageError
+from magtiles.schemas.errors import CoverageError, ParameterError
 from magtiles.stages.field import components, crop, voids
 from magtiles.stages.field.extent import data_bounds
 from magtiles.stages.field.geometry import true_spacing
@@ -45,41 +45,27 @@ def plan_survey_map(source: SurveyMap, folder: Path, data: Path | None, steps: S
     Raises SourceError, FormatError and ContractError for bad data; CoverageError for levels
     below the survey or too close.
     """
-    wanted, files = source.table, _data_files(source, data)
+    wanted, files = source.table, data_files(source.source, data)
     survey = _survey(wanted, [source.path, *files], folder, steps)
     heights = _heights(wanted, survey.height_m)
     spacing = wanted.spacing_m or _default_spacing(survey, heights)
     lattice = plan_lattice(survey.bounds, spacing, wanted.tile_deg)
+    inputs = manifest_inputs(source.source, files, "survey")
+    surface: list[Path] = []
+    if source.surface is not None:
+        surface = source.surface.lay(survey.grid, lattice, folder, data, steps)
+        inputs += source.surface.inputs(data)
     names = ["survey.nc", *(["cropped.nc"] if wanted.region is not None else []), "filled.nc"]
     return MapPlan(
         lattice=lattice,
         heights=heights,
         level=lambda height: _level(wanted, survey, lattice, height, folder, steps),
-        artifacts=[folder / name for name in names],
-        inputs=_inputs(source, files),
+        artifacts=[*(folder / name for name in names), *surface],
+        inputs=inputs,
         source=source.path,
         core_field=igrf_coefficients(survey.reference_field),
+        surface=surface[-1] if surface else None,
     )
-
-
-def _data_files(source: SurveyMap, data: Path | None) -> list[Path]:
-    """The source's data files: in `data` where it is given, else beside the source TOML."""
-    if data is None:
-        return list(source.source.files)
-    return [data / file.name for file in source.source.files]
-
-
-def _inputs(source: SurveyMap, files: Sequence[Path]) -> list[dict[str, str]]:
-    header = source.source.source
-    return [
-        {
-            "id": f"{header.id}/{file.name}" if len(files) > 1 else header.id,
-            "sha256": receipts.digest(file),
-            "licence": header.licence,
-            "role": "survey",
-        }
-        for file in files
-    ]
 
 
 def _survey(wanted: AnomalyTable, files: Sequence[Path], folder: Path, steps: Steps) -> Survey:
@@ -88,6 +74,7 @@ def _survey(wanted: AnomalyTable, files: Sequence[Path], folder: Path, steps: St
     with open_artifact(grid) as opened:
         height, cell = float(np.mean(opened["height"])), min(true_spacing(opened))
         reference_field = str(opened.attrs["reference_field"])
+        _check_reference(wanted, str(opened.attrs["height_reference"]))
     region = wanted.region
     if region is not None:
         gain = max(abs(h - height) for h in wanted.heights_m)
@@ -100,6 +87,17 @@ def _survey(wanted: AnomalyTable, files: Sequence[Path], folder: Path, steps: St
             bounds = data_bounds(opened)
     filled = steps.run(voids.STAGE, {"grid": grid}, folder / "filled.nc", {})
     return Survey(filled, height, cell, bounds, reference_field)
+
+
+def _check_reference(wanted: AnomalyTable, of_survey: str) -> None:
+    """Raise ParameterError where the survey's own file counts heights from something else."""
+    if wanted.height_reference != of_survey:
+        raise ParameterError(
+            f"height_reference is '{wanted.height_reference}'",
+            where="anomaly",
+            expected=f"'{of_survey}', which the survey's file states",
+            remedy="give heights above the survey's own reference",
+        )
 
 
 def _heights(wanted: AnomalyTable, survey_height: float) -> list[float]:

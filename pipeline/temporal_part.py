@@ -13,9 +13,8 @@ import pydantic
 import xarray as xr
 
 from magtiles.catalog.releases.temporal_table import TEMPORAL_VARIABLES
-from magtiles.pipeline import receipts
 from magtiles.pipeline.artifacts import open_artifact
-from magtiles.pipeline.source_paths import find_source
+from magtiles.pipeline.source_paths import data_files, find_source, manifest_inputs
 from magtiles.pipeline.steps import Steps
 from magtiles.pipeline.temporal_plots import StationData, draw_station
 from magtiles.schemas.errors import CoverageError, SourceError
@@ -114,7 +113,7 @@ def build_temporal(
         item
         for role, sources in (("observatory", wanted.observatories), ("index", wanted.indices))
         for source in sources
-        for item in _inputs(source, _files(source, data), role)
+        for item in manifest_inputs(source, data_files(source, data), role)
     ]
     activity = _index(wanted, folder, data, steps)
     made = [_station(s, activity, folder, data, steps) for s in wanted.observatories]
@@ -142,7 +141,7 @@ def _index(wanted: TemporalSources, folder: Path, data: Path | None, steps: Step
     files = [
         file
         for source in wanted.indices
-        for file in locate_all([source.path, *_files(source, data)], ACTIVITY_INDEX)[0]
+        for file in locate_all([source.path, *data_files(source, data)], ACTIVITY_INDEX)[0]
     ]
     return steps.run(ingest_index.STAGE, {"files": files}, folder / "index.nc", {})
 
@@ -151,7 +150,7 @@ def _station(
     source: Source[Any], activity: Path | None, folder: Path, data: Path | None, steps: Steps
 ) -> StationData:
     name = source.source.id
-    files = [source.path, *_files(source, data)]
+    files = [source.path, *data_files(source, data)]
     record = steps.run(ingest_observatory.STAGE, {"files": files}, folder / f"{name}-record.nc", {})
     series = steps.run(check.STAGE, {"series": record}, folder / f"{name}-series.nc", {})
     of_activity = {} if activity is None else {"index": activity}
@@ -165,24 +164,6 @@ def _station(
         {},
     )
     return StationData(record, series, curves, fits)
-
-
-def _files(source: Source[Any], data: Path | None) -> list[Path]:
-    """A source's data files: in `data` where it is given, else beside the source TOML."""
-    return [f if data is None else data / f.name for f in source.files]
-
-
-def _inputs(source: Source[Any], files: Sequence[Path], role: str) -> list[dict[str, str]]:
-    header = source.source
-    return [
-        {
-            "id": f"{header.id}/{file.name}" if len(files) > 1 else header.id,
-            "sha256": receipts.digest(file),
-            "licence": header.licence,
-            "role": role,
-        }
-        for file in files
-    ]
 
 
 def _of_months(model: xr.Dataset, months: Sequence[str]) -> xr.Dataset:

@@ -63,8 +63,8 @@ def to_wgs84(
             f"how the datum '{datum}' relates to WGS84 is not known",
             where=f"crs '{crs.name}'",
             expected="a CRS whose datum is stated",
-            remedy=f"state the whole CRS with its datum, as in crs = '{_with_datum(crs)}' under "
-            "[grid], or accept an error of up to some 200 m with allow_ballpark_datum = true",
+            remedy=f"state the whole CRS with its datum, as in crs = '{_with_datum(crs)}' in "
+            "its source TOML, or accept an error of up to some 200 m with allow_ballpark_datum = true",
         )
     return group.transformers[0]
 

@@ -22,6 +22,7 @@ from magtiles.stages.field.spectral import (
     TENSOR,
     VECTOR,
 )
+from magtiles.stages.field.surface import surface_at
 from magtiles.stages.field.target import Axis, Nodes, Target, geographic_target, locate, own_target
 from magtiles.stages.field.uncertainty import uncertainty
 
@@ -159,7 +160,7 @@ def _assemble(
 ) -> xr.Dataset:
     planar = target.dims[0] == "y"
     height = grid["height"]
-    return assemble_level(
+    level = assemble_level(
         target.dims,
         (target.rows, target.columns),
         products,
@@ -170,6 +171,9 @@ def _assemble(
         crs=grid["crs"].variable if planar else wgs84_variable(),
         attributes={k: v for k, v in grid.attrs.items() if k not in _DROPPED or planar},
     )
+    if (surface := surface_at(grid, target)) is not None:
+        level["reference_surface_height"] = surface
+    return level
 
 
 STAGE = Stage(

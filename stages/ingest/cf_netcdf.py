@@ -13,15 +13,11 @@ from numpy.typing import NDArray
 from pyproj.exceptions import CRSError
 
 from magtiles.schemas.errors import FormatError, SourceError
+from magtiles.stages.ingest.foreign import read_foreign
 from magtiles.stages.ingest.gmt_netcdf import is_old_gmt, read_old_gmt
-from magtiles.stages.ingest.raw import RawGrid, is_magnetic
-from magtiles.stages.ingest.source import IngestGridParams
+from magtiles.stages.ingest.raw import METRES, RawGrid
+from magtiles.stages.ingest.source import GridFileParams
 
-_DEFLATE_LIMIT = 1032  # the most zlib can expand: a file that declares more holds none of it
-
-_METRES = {"m": 1.0, "metre": 1.0, "meter": 1.0, "metres": 1.0, "meters": 1.0}
-_METRES |= {"km": 1000.0, "kilometre": 1000.0, "kilometer": 1000.0}
-_METRES |= {"us_survey_foot": 1200.0 / 3937.0, "ft": 0.3048, "foot": 0.3048, "feet": 0.3048}
 _NORTH = ("degrees_north", "degree_north", "degrees_n", "degree_n")
 _EAST = ("degrees_east", "degree_east", "degrees_e", "degree_e")
 
@@ -30,14 +26,15 @@ _STATED = (
     "reference_epoch",
     "anomaly_definition",
     "height_reference",
+    "surface",
     "line_spacing_m",
     "source_distance_m",
     "wavelength_band_km",
 )
 
 
-def read_cf(path: Path, params: IngestGridParams) -> RawGrid:
-    """The magnetic variable of a CF netCDF file, its nodes, CRS and what its attributes state.
+def read_cf(path: Path, params: GridFileParams) -> RawGrid:
+    """The variable of a CF netCDF file, its nodes, CRS and what its attributes state.
 
     Raises FormatError for a damaged file, missing or curvilinear coordinates; SourceError
     where the variable is not clear.
@@ -47,32 +44,20 @@ def read_cf(path: Path, params: IngestGridParams) -> RawGrid:
 
 
 def _load(path: Path) -> xr.Dataset:
-    with path.open("rb") as file:
-        classic = file.read(3) == b"CDF"
-    # The netCDF library fills what a truncated classic file lacks with zeros; SciPy refuses it.
-    engine = "scipy" if classic else "netcdf4"
-    size = path.stat().st_size
+    found = read_foreign(path)
+    arrays = {name: (v.dims, v.values, v.attrs) for name, v in found.variables.items()}
     try:
         # xarray unpacks into float32, so packed integers are unpacked here in float64.
-        with xr.open_dataset(
-            path, engine=engine, mask_and_scale=False, decode_times=False
-        ) as dataset:
-            if dataset.nbytes > _DEFLATE_LIMIT * size:
-                raise FormatError(
-                    f"declares {dataset.nbytes} bytes of arrays in a file of {size}",
-                    where=path,
-                    remedy="fetch it again",
-                )
-            return dataset.load()
-    except (OSError, RuntimeError, ValueError, TypeError, LookupError) as caught:
+        return xr.decode_cf(
+            xr.Dataset(arrays, attrs=found.attrs), mask_and_scale=False, decode_times=False
+        )
+    except (ValueError, TypeError, LookupError) as caught:
         raise FormatError(
-            f"is not a whole netCDF file: {str(caught).replace(str(path), path.name)}",
-            where=path,
-            remedy="fetch it again",
+            f"its variables do not fit together: {caught}", where=path, remedy="fetch it again"
         ) from None
 
 
-def _read(dataset: xr.Dataset, path: Path, params: IngestGridParams) -> RawGrid:
+def _read(dataset: xr.Dataset, path: Path, params: GridFileParams) -> RawGrid:
     name = _choose_variable(dataset, path, params)
     where = f"{path} variable '{name}'"
     variable = dataset[name]
@@ -96,7 +81,7 @@ def _read(dataset: xr.Dataset, path: Path, params: IngestGridParams) -> RawGrid:
     )
 
 
-def _choose_variable(dataset: xr.Dataset, path: Path, params: IngestGridParams) -> str:
+def _choose_variable(dataset: xr.Dataset, path: Path, params: GridFileParams) -> str:
     grids = [str(n) for n, v in dataset.data_vars.items() if v.squeeze().ndim == 2]
     if params.variable is not None:
         if params.variable not in grids:
@@ -106,15 +91,17 @@ def _choose_variable(dataset: xr.Dataset, path: Path, params: IngestGridParams) 
                 expected=f"one of {', '.join(grids) or 'none'}",
             )
         return params.variable
-    magnetic = [n for n in grids if is_magnetic(str(dataset[n].attrs.get("units", "")))]
-    found = [n for n in magnetic if n.removesuffix("_uncertainty") not in set(magnetic) - {n}]
+    measures = params.measures
+    right = [n for n in grids if measures.knows(str(dataset[n].attrs.get("units", "")))]
+    found = [n for n in right if n.removesuffix("_uncertainty") not in set(right) - {n}]
     if not found and params.units is not None:
         found = [n for n in grids if "units" not in dataset[n].attrs]
     if len(found) != 1:
         raise SourceError(
-            f"{len(found)} variables could be the anomaly: {', '.join(found) or 'none'}",
+            f"{len(found)} variables could be the grid's: {', '.join(found) or 'none'}",
             where=path,
-            expected="one two-dimensional variable with a magnetic unit such as nT",
+            expected=f"one two-dimensional variable with the unit of {measures.name}, "
+            f"such as {measures.unit}",
             remedy=f"choose one with the key 'variable' (grids: {', '.join(grids) or 'none'})",
         )
     return found[0]
@@ -171,14 +158,14 @@ def _nodes(
         # A coordinate may stand anywhere in its cell (CF 7.1); the value is the cell's.
         nodes = _unpacked(dataset[bounds], None).mean(axis=1)
     unit = str(coordinate.attrs.get("units", "")).lower()
-    factor = _METRES.get(unit, 1.0)
-    if crs is not None and crs.is_projected and unit in _METRES:
+    factor = METRES.get(unit, 1.0)
+    if crs is not None and crs.is_projected and unit in METRES:
         factor /= crs.axis_info[0].unit_conversion_factor
     elif crs is not None and crs.is_projected and unit:
         raise FormatError(
             f"coordinate '{dim}' is in '{unit}', but the CRS is projected",
             where=where,
-            expected=f"one of {', '.join(_METRES)}",
+            expected=f"one of {', '.join(METRES)}",
         )
     return nodes * factor, rounding * factor
 

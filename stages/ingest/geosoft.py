@@ -10,7 +10,7 @@ import numpy as np
 
 from magtiles.schemas.errors import FormatError
 from magtiles.stages.ingest.raw import RawGrid
-from magtiles.stages.ingest.source import IngestGridParams
+from magtiles.stages.ingest.source import GridFileParams
 
 HEADER_BYTES = 512
 _ELEMENT_BYTES = (1, 2, 4, 8, 1025, 1026, 1028, 1032)
@@ -32,7 +32,7 @@ def is_geosoft(head: bytes) -> bool:
     )
 
 
-def read_geosoft(path: Path, params: IngestGridParams) -> RawGrid:
+def read_geosoft(path: Path, params: GridFileParams) -> RawGrid:
     """A Geosoft grid; values are at points, dummies NaN. Its header has no CRS that others know.
 
     Raises FormatError where the file is truncated, rotated, or of an ordering or colour form

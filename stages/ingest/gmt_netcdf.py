@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from magtiles.schemas.errors import FormatError
 from magtiles.stages.ingest.raw import RawGrid, mark_voids
-from magtiles.stages.ingest.source import IngestGridParams
+from magtiles.stages.ingest.source import GridFileParams
 
 _VARIABLES = {"x_range", "y_range", "spacing", "dimension", "z"}
 
@@ -24,7 +24,7 @@ def is_old_gmt(dataset: xr.Dataset) -> bool:
     return set(dataset.variables) >= _VARIABLES and dataset["z"].ndim == 1
 
 
-def read_old_gmt(dataset: xr.Dataset, path: Path, params: IngestGridParams) -> RawGrid:
+def read_old_gmt(dataset: xr.Dataset, path: Path, params: GridFileParams) -> RawGrid:
     """The grid of an old GMT file, north row first. Such files state neither CRS nor unit.
 
     Raises FormatError where the declared shape is not that of the values.

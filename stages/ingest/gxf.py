@@ -19,7 +19,7 @@ from rasterio.errors import RasterioError
 
 from magtiles.schemas.errors import FormatError, SourceError
 from magtiles.stages.ingest.raw import RawGrid, mark_voids
-from magtiles.stages.ingest.source import IngestGridParams
+from magtiles.stages.ingest.source import GridFileParams
 
 _LOG = logging.getLogger(__name__)
 
@@ -47,7 +47,7 @@ _USGS_PROJECTIONS = {
 }
 
 
-def read_gxf(path: Path, params: IngestGridParams) -> RawGrid:
+def read_gxf(path: Path, params: GridFileParams) -> RawGrid:
     """A GXF grid; its values are at points, the first at the lower left.
 
     Raises FormatError where the file is truncated, compressed, rotated or malformed.

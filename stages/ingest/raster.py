@@ -24,7 +24,7 @@ from rasterio.io import MemoryFile
 from magtiles.schemas.errors import FormatError, SourceError
 from magtiles.stages.ingest.files import check_tiff_directories
 from magtiles.stages.ingest.raw import RawGrid
-from magtiles.stages.ingest.source import IngestGridParams
+from magtiles.stages.ingest.source import GridFileParams
 
 _ALONE = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_PAM_ENABLED": "NO"}
 
@@ -91,7 +91,7 @@ KINDS = tuple(_FORMATS)
 """What `files.sniff` calls the formats read here."""
 
 
-def read_raster(kind: str, path: Path, params: IngestGridParams) -> RawGrid:
+def read_raster(kind: str, path: Path, params: GridFileParams) -> RawGrid:
     """One band of a raster of one of `KINDS`, with its cell centres.
 
     GDAL gives cell corners for either registration, so nodes are always the cells' centres.
@@ -125,7 +125,7 @@ def _opened(path: Path, form: _Format) -> Iterator[Any]:
         yield dataset
 
 
-def _read(dataset: Any, path: Path, params: IngestGridParams) -> RawGrid:
+def _read(dataset: Any, path: Path, params: GridFileParams) -> RawGrid:
     band = _choose_band(dataset, path, params.band)
     x, y = _nodes(dataset, path)
     stored = dataset.read(band, masked=True)

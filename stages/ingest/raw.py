@@ -37,6 +37,47 @@ class RawGrid:
     uncertainty: NDArray[np.float64] | None = None
 
 
+@dataclass(frozen=True)
+class Quantity:
+    """What the values of a grid are.
+
+    Attributes
+    ----------
+    name : for messages, with its article.
+    unit : ours.
+    units : how many of ours one of another unit is, by its name in lower case.
+    largest : beyond which, in our unit, a value is a void mark or in another unit.
+    """
+
+    name: str
+    unit: str
+    units: Mapping[str, float]
+    largest: float
+
+    def knows(self, unit: str) -> bool:
+        """Whether `per` takes a unit."""
+        return unit.strip().lower() in self.units
+
+    def per(self, unit: str, *, where: object) -> float:
+        """How many of our unit one `unit` is. SourceError, naming the key, for any other unit."""
+        if not self.knows(unit):
+            raise SourceError(
+                f"the unit '{unit}' is not {self.name}, or ambiguous",
+                where=where,
+                expected=f"one of {', '.join(self.units)}",
+                remedy="state it with the key 'units' if the file does not, or convert the file",
+            )
+        return self.units[unit.strip().lower()]
+
+
+METRES = {"m": 1.0, "metre": 1.0, "meter": 1.0, "metres": 1.0, "meters": 1.0}
+METRES |= {"km": 1000.0, "kilometre": 1000.0, "kilometer": 1000.0}
+METRES |= {"us_survey_foot": 1200.0 / 3937.0, "us survey foot": 1200.0 / 3937.0}
+METRES |= {"ft": 0.3048, "foot": 0.3048, "feet": 0.3048}
+
+# No surface lies higher above the sea or deeper below it; DEMs mark voids with -32768, 32767 ...
+ELEVATION = Quantity("a length", "m", METRES, 12_000.0)
+
 _NANOTESLA = {
     "nt": 1.0,
     "nanotesla": 1.0,
@@ -56,22 +97,13 @@ _NANOTESLA = {
 }
 
 
+# No crustal anomaly is larger; the whole field is about 25-65 thousand nT.
+FLUX_DENSITY = Quantity("a magnetic flux density", "nT", _NANOTESLA, 1e5)
+
+
 def nanotesla_per(unit: str, *, where: object) -> float:
     """How many nT one `unit` is. Raises SourceError, naming the key, for any other unit."""
-    try:
-        return _NANOTESLA[unit.strip().lower()]
-    except KeyError:
-        raise SourceError(
-            f"the unit '{unit}' is not a magnetic flux density, or ambiguous",
-            where=where,
-            expected=f"one of {', '.join(_NANOTESLA)}",
-            remedy="state it with the key 'units' if the file does not, or convert the file",
-        ) from None
-
-
-def is_magnetic(unit: str) -> bool:
-    """Whether a unit is one that `nanotesla_per` knows."""
-    return unit.strip().lower() in _NANOTESLA
+    return FLUX_DENSITY.per(unit, where=where)
 
 
 def mark_voids(values: NDArray[Any], mark: float | None) -> NDArray[np.float64]:

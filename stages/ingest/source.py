@@ -7,12 +7,13 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Generic, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar
 
 import pydantic
 
 from magtiles.schemas.errors import IntegrityError, SourceError
 from magtiles.stages.declare import IsoDate, Params, parse_params, quantity
+from magtiles.stages.ingest.raw import ELEVATION, FLUX_DENSITY, Quantity
 
 TOTAL_FIELD_ANOMALY = "total-field anomaly: |F| minus the reference field's magnitude"
 
@@ -23,10 +24,46 @@ def _rising(band: tuple[float, float]) -> tuple[float, float]:
     return band
 
 
-class IngestGridParams(Params):
-    """The [grid] keys of a source: what an anomaly grid's file does not say itself."""
+class GridFileParams(Params):
+    """What the file of any grid does not say itself; `measures` is what its values are."""
+
+    measures: ClassVar[Quantity]
 
     crs: str | None = quantity("1", default=None, doc="CRS: EPSG code, PROJ string or WKT.")
+    units: str | None = quantity(
+        "1",
+        default=None,
+        doc="Unit of the values; default nT, or m of heights, where the file does not say.",
+    )
+    no_data: float | None = quantity(
+        "1", default=None, doc="Value that marks a void where the file does not say, as stored."
+    )
+    registration: Literal["pixel", "point"] | None = quantity(
+        "1", default=None, doc="Whether values are for cells or for their coordinates."
+    )
+    band: int | None = quantity("1", default=None, ge=1, doc="Raster band, counted from 1.")
+    variable: str | None = quantity("1", default=None, doc="Variable of a netCDF file.")
+    member: str | None = quantity(
+        "1", default=None, doc="File of a zip archive that holds several."
+    )
+    columns: tuple[int, int, int] = quantity(
+        "1", default=(1, 2, 3), doc="Columns of x, y and value of a text grid, counted from 1."
+    )
+    allow_ballpark_datum: bool = quantity(
+        "1", default=False, doc="Accept a datum whose relation to WGS84 is not known."
+    )
+
+    @property
+    def all_columns(self) -> tuple[int, ...]:
+        """Columns of a text grid to read: x, y, value and, where it has one, its uncertainty."""
+        return self.columns
+
+
+class IngestGridParams(GridFileParams):
+    """The [grid] keys of a source: what an anomaly grid's file does not say itself."""
+
+    measures = FLUX_DENSITY
+
     height_m: float | None = quantity("m", default=None, doc="Height of the survey surface.")
     height_reference: Literal["ellipsoid", "mean_sea_level", "terrain"] | None = quantity(
         "1", default=None, doc="What the height counts from."
@@ -55,28 +92,31 @@ class IngestGridParams(Params):
     wavelength_band_km: Annotated[tuple[float, float], pydantic.AfterValidator(_rising)] | None = (
         quantity("km", default=None, doc="Wavelengths the grid holds, shortest and longest.")
     )
-    units: str | None = quantity(
-        "1", default=None, doc="Unit of the values; default nT where the file does not say."
-    )
-    no_data: float | None = quantity(
-        "1", default=None, doc="Value that marks a void where the file does not say, as stored."
-    )
-    registration: Literal["pixel", "point"] | None = quantity(
-        "1", default=None, doc="Whether values are for cells or for their coordinates."
-    )
-    band: int | None = quantity("1", default=None, ge=1, doc="Raster band, counted from 1.")
-    variable: str | None = quantity("1", default=None, doc="Variable of a netCDF file.")
-    member: str | None = quantity(
-        "1", default=None, doc="File of a zip archive that holds several."
-    )
-    columns: tuple[int, int, int] = quantity(
-        "1", default=(1, 2, 3), doc="Columns of x, y and value of a text grid, counted from 1."
-    )
     uncertainty_column: int | None = quantity(
         "1", default=None, ge=1, doc="Column of a text grid with 1 sigma of the value."
     )
-    allow_ballpark_datum: bool = quantity(
-        "1", default=False, doc="Accept a datum whose relation to WGS84 is not known."
+
+    @property
+    def all_columns(self) -> tuple[int, ...]:
+        """As `GridFileParams.all_columns`."""
+        return self.columns + (
+            () if self.uncertainty_column is None else (self.uncertainty_column,)
+        )
+
+
+class IngestSurfaceParams(GridFileParams):
+    """The [surface] keys of a source: the height of terrain or geoid."""
+
+    measures = ELEVATION
+
+    surface: Literal["terrain", "mean_sea_level"] | None = quantity(
+        "1", default=None, doc="Which surface it is: a DEM's terrain, or the geoid."
+    )
+    height_reference: Literal["ellipsoid", "mean_sea_level"] | None = quantity(
+        "1", default=None, doc="What its heights count from; the geoid's from the ellipsoid."
+    )
+    undulation_m: float | None = quantity(
+        "m", default=None, doc="Geoid height that makes heights above sea level ellipsoidal."
     )
 
 
@@ -106,6 +146,7 @@ class SourceKind(Generic[P]):
 
 
 ANOMALY_GRID = SourceKind("anomaly-grid", "grid", IngestGridParams)
+SURFACE_GRID = SourceKind("surface-grid", "surface", IngestSurfaceParams)
 
 
 @dataclass(frozen=True)

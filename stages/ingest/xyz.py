@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from magtiles.schemas.errors import FormatError, SourceError
 from magtiles.stages.ingest.raw import RawGrid, mark_voids
-from magtiles.stages.ingest.source import IngestGridParams
+from magtiles.stages.ingest.source import GridFileParams
 
 _NUMBER = re.compile(rb"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|nan", re.IGNORECASE)
 _OFF_NODE = 0.05  # of a step
@@ -39,15 +39,14 @@ def _words(line: bytes) -> list[bytes]:
     return [word for word in re.split(rb"[\s,;]+", line.strip()) if word]
 
 
-def read_xyz(path: Path, params: IngestGridParams) -> RawGrid:
+def read_xyz(path: Path, params: GridFileParams) -> RawGrid:
     """A regular grid from lines in any order; nodes without a line are voids.
 
     Raises FormatError naming the line for text that is no number, a node off the lattice or
     given twice; SourceError for columns that are not there.
     """
     _refuse_cut(path)
-    columns = [*params.columns, *([params.uncertainty_column] if params.uncertainty_column else [])]
-    table, first_line = _table(path, columns)
+    table, first_line = _table(path, list(params.all_columns))
     x, columns_of = _axis(table[:, 0], path, first_line, "x")
     y, rows_of = _axis(table[:, 1], path, first_line, "y")
     if x.size * y.size > _LARGEST or x.size * y.size > 64 * len(table) + 64:

@@ -33,7 +33,9 @@ from magtiles.stages.ingest.log.source import TRACK, Columns, IngestLogParams
 from magtiles.stages.ingest.observatory.stage import OBSERVATORY_SERIES, IngestObservatoryParams
 from magtiles.stages.ingest.source import (
     ANOMALY_GRID,
+    SURFACE_GRID,
     IngestGridParams,
+    IngestSurfaceParams,
     SourceKind,
     SourceParams,
     load_source,
@@ -44,6 +46,7 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 TABLES = {
     "[source]": SourceParams,
     "[grid]": IngestGridParams,
+    "[surface]": IngestSurfaceParams,
     "[product]": ProductTable,
     "[anomaly]": AnomalyTable,
     "[coefficients]": CoefficientsParams,
@@ -55,7 +58,7 @@ TABLES = {
     "region": RegionTable,
 }
 KINDS: dict[str, SourceKind[Any]] = {
-    kind.name: kind for kind in (ANOMALY_GRID, FIELD_MODEL, OBSERVATORY_SERIES, TRACK)
+    kind.name: kind for kind in (ANOMALY_GRID, FIELD_MODEL, OBSERVATORY_SERIES, SURFACE_GRID, TRACK)
 }
 
 
