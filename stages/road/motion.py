@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from magtiles.catalog.flags import TrackFlag
 from magtiles.schemas.errors import ContractError, CoverageError
 from magtiles.stages.road.plane import Plane
-from magtiles.stages.road.smoother import Observed, most_probable_path
+from magtiles.stages.road.smoother import Observed, Path, most_probable_path
 
 Real = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -29,6 +29,8 @@ _FASTEST = 100.0
 """Of a road vehicle, m/s."""
 _BELIEVED = 0.1
 """Weight below which a fix counts as refused."""
+_MOST_REFUSED = 0.1
+"""Share of refused fixes that a receiver may have."""
 _TRUSTED_S = 5.0
 """A place further than this in time from any believed fix is doubtful."""
 
@@ -110,16 +112,46 @@ def motion_of(track: xr.Dataset, *, position_sigma_m: float, standstill_m_s: flo
     if not np.isfinite(wheel).any():
         free = most_probable_path(Observed(seconds, seen_place, seen_sigma, wheel, still))
         still = _stands(seconds, free.place, standstill_m_s)
-    path = most_probable_path(Observed(seconds, seen_place, seen_sigma, wheel, still))
+    path = _path(Observed(seconds, seen_place, seen_sigma, wheel, still))
     _check_speed(path.velocity, seconds, start, track)
-    step = np.linalg.norm(np.diff(path.place, axis=0), axis=1)
-    step[still[1:] & still[:-1]] = 0.0
-    distance = np.concatenate([[0.0], np.cumsum(step)])
     believed = np.nan_to_num(path.weight) > _BELIEVED
+    _check_believed(believed[row >= 0], time, track)
+    step = np.linalg.norm(np.diff(path.place, axis=0), axis=1)
+    distance = np.concatenate([[0.0], np.cumsum(step)])
     return Motion(
         plane, start, seconds, path.place, path.velocity, distance, still,
         _far_in_time(seconds, believed), path.wheel_scale,
     )  # fmt: skip
+
+
+def _path(seen: Observed) -> Path:
+    """The most probable path, in which a standstill of any length is one node.
+
+    Its place counts as one fix, the median of those that it had: the errors of a receiver at
+    rest are much the same all the time, and no more certain for lasting.
+    """
+    begins = seen.still & ~np.concatenate([[False], seen.still[:-1]])
+    kept = np.flatnonzero(~seen.still | begins)
+    group = np.cumsum(~seen.still | begins) - 1
+    place = seen.place[kept]
+    for first, stood in enumerate(np.split(seen.place, kept[1:])):
+        known = np.isfinite(stood).all(axis=1)
+        if len(stood) > 1 and known.any():
+            place[first] = np.median(stood[known], axis=0)
+    if kept.size == 1:
+        return _standing(place[0], len(seen.seconds))
+    step = np.diff(seen.seconds)
+    step[seen.still[1:] & seen.still[:-1]] = 0.0
+    driven = np.concatenate([[0.0], np.cumsum(step)])
+    path = most_probable_path(
+        Observed(driven[kept], place, seen.sigma[kept], seen.wheel_speed[kept], seen.still[kept])
+    )
+    weight = np.where(np.isfinite(seen.place).all(axis=1), path.weight[group], np.nan)
+    return Path(path.place[group], path.velocity[group], weight, path.wheel_scale)
+
+
+def _standing(place: Real, count: int) -> Path:
+    return Path(np.tile(place, (count, 1)), np.zeros((count, 2)), np.ones(count), np.nan)
 
 
 def _fixes(track: xr.Dataset, sigma_m: float) -> tuple[Times, Real, Real, Real]:
@@ -206,6 +238,19 @@ def _check_speed(velocity: Real, seconds: Real, start: np.datetime64, track: xr.
             f"the places jump: {speed[worst]:.0f} m/s at {when}",
             where=track.attrs.get("source"),
             expected=f"at most {_FASTEST:g} m/s",
+            remedy="flag the false fixes FIX_OUTLIER, or cut the log there",
+        )
+
+
+def _check_believed(believed: Mask, time: Times, track: xr.Dataset) -> None:
+    """Refuse fixes of which many contradict the others and the wheels."""
+    refused = int((~believed).sum())
+    if refused > _MOST_REFUSED * len(believed):
+        raise ContractError(
+            f"the places jump: {refused} of {len(believed)} fixes contradict the others, first "
+            f"at {time[np.argmin(believed)]}",
+            where=track.attrs.get("source"),
+            expected=f"at most {_MOST_REFUSED:.0%}",
             remedy="flag the false fixes FIX_OUTLIER, or cut the log there",
         )
 
