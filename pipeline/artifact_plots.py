@@ -10,7 +10,8 @@ import xarray as xr
 
 from magtiles.pipeline.artifacts import check_artifact, open_artifact
 from magtiles.pipeline.calibration_plots import calibration_figure
-from magtiles.pipeline.compensation_plots import compensation_figure, track_figure
+from magtiles.pipeline.compensation_plots import compensation_figure
+from magtiles.pipeline.track_plots import track_figure
 from magtiles.schemas.errors import UsageError
 
 if TYPE_CHECKING:

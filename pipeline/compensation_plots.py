@@ -1,8 +1,8 @@
-"""Pictures of tracks: compensation before and after, and the path coloured by its anomaly."""
+"""Pictures of a compensated track: the field before and after, in time and its spectra."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.signal
@@ -24,7 +24,6 @@ _BAND_HZ = (0.1, 0.9)
 # Okabe and Ito's palette.
 _MEASURED, _COMPENSATED, _SWING = "#D55E00", "#0072B2", "#E9E9E0"
 _SPECTRUM_S = 40.0
-_ROBUST = 99.0  # percent of samples within the colours
 
 
 def compensation_figure(track: xr.Dataset) -> Figure:
@@ -38,7 +37,13 @@ def compensation_figure(track: xr.Dataset) -> Figure:
     from matplotlib.figure import Figure
 
     names = ("field_total_raw", "field_total")
-    _require(track, names, "what apply-tolles-lawson makes")
+    for name in names:
+        if name not in track:
+            raise ContractError(
+                f"'{name}' is missing",
+                where=track.attrs.get("source"),
+                expected="what apply-tolles-lawson makes",
+            )
     fields = {name: track[name].values.astype(np.float64) for name in names}
     runs = _runs(track, fields["field_total"])
     band = Filter(*_BAND_HZ)
@@ -62,75 +67,6 @@ def compensation_figure(track: xr.Dataset) -> Figure:
     about = f"{track.attrs.get('compensation', 'compensation')}: {track.attrs['source']}"
     figure.suptitle(about, x=0.01, ha="left", weight="bold")
     return figure
-
-
-def track_figure(track: xr.Dataset) -> Figure:
-    """Draw the path of a track in true shape, coloured by its anomaly.
-
-    A track without `magnetic_anomaly` is coloured by its total field less the median. Raises
-    ContractError for a track without either, or without places.
-    """
-    from matplotlib.colors import CenteredNorm
-    from matplotlib.figure import Figure
-
-    name = "magnetic_anomaly" if "magnetic_anomaly" in track else "field_total"
-    _require(track, (name,), "an anomaly or a total field, nT")
-    values = track[name].values.astype(np.float64)
-    latitude, longitude = track["latitude"].values, np.unwrap(_finite(track), period=360.0)
-    known = np.isfinite(values) & np.isfinite(latitude) & np.isfinite(longitude)
-    if not known.any():
-        raise ContractError(
-            "no sample has both a place and a field", where=track.attrs.get("source")
-        )
-    label = "total-field anomaly (nT)"
-    if name == "field_total":
-        middle = float(np.median(values[known]))
-        values, label = values - middle, f"total field less {middle:.0f} nT (nT)"
-    limit = float(np.percentile(np.abs(values[known]), _ROBUST)) or 1.0
-    cosine = float(np.cos(np.radians(latitude[known].mean())))
-    shape = float(np.ptp(latitude[known])) / (float(np.ptp(longitude[known])) * cosine or 1.0)
-    figure = Figure(
-        figsize=(8.0, float(np.clip(7.4 * shape + 1.7, 3.5, 9.0))), layout="constrained"
-    )
-    axes = figure.add_subplot()
-    axes.plot(longitude, latitude, color="#BBBBBB", linewidth=0.5, zorder=1)
-    norm: Any = CenteredNorm(0.0, limit)
-    dots = axes.scatter(
-        longitude[known], latitude[known], c=values[known], s=6, norm=norm, cmap="RdBu_r", zorder=2
-    )
-    clipped = bool(np.abs(values[known]).max() > limit)
-    figure.colorbar(
-        dots,
-        ax=axes,
-        label=label,
-        extend="both" if clipped else "neither",
-        location="bottom" if shape < 0.8 else "right",
-        aspect=40,
-    )
-    axes.set_aspect(1.0 / cosine)
-    axes.set(xlabel="longitude (degrees east)", ylabel="latitude (degrees north)")
-    axes.ticklabel_format(useOffset=False)
-    axes.margins(0.05)
-    figure.suptitle(str(track.attrs["source"]), x=0.01, ha="left", weight="bold")
-    return figure
-
-
-def _require(track: xr.Dataset, names: tuple[str, ...], expected: str) -> None:
-    for name in names:
-        if name not in track:
-            raise ContractError(
-                f"'{name}' is missing", where=track.attrs.get("source"), expected=expected
-            )
-
-
-def _finite(track: xr.Dataset) -> Floats:
-    """Longitudes; gaps bridged, since one NaN would break what unwraps them."""
-    longitude = track["longitude"].values.astype(np.float64)
-    known = np.flatnonzero(np.isfinite(longitude))
-    if known.size == 0:
-        return longitude
-    bridged = longitude[known][np.searchsorted(known, np.arange(longitude.size)) - 1]
-    return np.where(np.isfinite(longitude), longitude, bridged)
 
 
 def _runs(track: xr.Dataset, field: Floats) -> list[Run]:

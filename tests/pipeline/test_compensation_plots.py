@@ -12,8 +12,9 @@ import xarray as xr
 from cloverleaf import angles, flight
 
 from magtiles.pipeline.artifacts import write_artifact
-from magtiles.pipeline.compensation_plots import compensation_figure, track_figure
+from magtiles.pipeline.compensation_plots import compensation_figure
 from magtiles.pipeline.main import main
+from magtiles.pipeline.track_plots import track_figure
 from magtiles.schemas.errors import ContractError
 from magtiles.stages.vehicle.tolles_lawson.apply import ApplyTollesLawsonParams, apply_tolles_lawson
 from magtiles.stages.vehicle.tolles_lawson.fit import FitTollesLawsonParams, fit_tolles_lawson
@@ -64,11 +65,31 @@ def test_the_path_is_in_true_shape_and_coloured(measured: xr.Dataset):
     values = measured["field_total"].values
     np.testing.assert_allclose(dots.get_array(), values - np.median(values))
     assert figure.axes[1].get_xlabel().startswith("total field less 52")
-    anomaly = measured.assign(magnetic_anomaly=("time", np.linspace(-5.0, 9.0, values.size)))
+    anomaly = measured.copy(deep=True)
+    anomaly["magnetic_anomaly"] = "time", np.linspace(-5.0, 9.0, values.size)
     anomaly["latitude"][5] = np.nan
     dots = track_figure(anomaly).axes[0].collections[0]
     assert np.asarray(dots.get_array()).size == values.size - 1
     assert dots.get_clim() == pytest.approx((-8.9, 8.9), abs=0.1)
+
+
+def test_a_vector_magnetometer_shows_its_magnitude_and_spectra(measured: xr.Dataset):
+    rng = np.random.default_rng(0)
+    time = measured.sizes["time"]
+    field = np.array([2e4, 0.0, 4e4]) + rng.normal(0.0, [10.0, 20.0, 40.0], (time, 3))
+    field[700] = np.nan
+    vector = measured.drop_vars("field_total").assign(field_body=(("time", "axis"), field))
+    figure = track_figure(vector)
+    path, _, spectra = figure.axes
+    found = np.asarray(path.collections[0].get_array())
+    length = np.linalg.norm(field, axis=1)
+    np.testing.assert_allclose(found, (length - np.nanmedian(length))[np.isfinite(length)])
+    for line, sigma in zip(spectra.lines, (10.0, 20.0, 40.0), strict=True):
+        # White noise at 10 Hz; 50 spectra averaged, so that their median scatters by 1 %.
+        density = np.median(np.asarray(line.get_ydata()))
+        assert density == pytest.approx(sigma / np.sqrt(5.0), rel=0.05)
+    uneven = vector.isel(time=np.sort(rng.choice(time, time // 2, replace=False)))
+    assert len(track_figure(uneven).axes) == 2  # path and colours
 
 
 REFUSED = {
@@ -78,7 +99,7 @@ REFUSED = {
         lambda t: t.assign(field_total_raw=t["field_total"]).isel(time=slice(0, 30)),
         "too short",
     ),
-    "no field": (track_figure, lambda t: t.drop_vars("field_total"), "'field_total' is missing"),
+    "no field": (track_figure, lambda t: t.drop_vars(["field_total", "field_body"]), "are missing"),
     "no place": (
         track_figure, lambda t: t.assign(longitude=t["longitude"] * np.nan), "no sample has both",
     ),
