@@ -54,7 +54,8 @@ def track_figure(track: xr.Dataset) -> Figure:
     figure = Figure(figsize=(8.0, height + _SPECTRA_INCH * bool(run)), layout="constrained")
     parts: list[Any] = [figure]
     if run:
-        parts = list(figure.subfigures(2, 1, height_ratios=[height, _SPECTRA_INCH]))
+        grid = figure.add_gridspec(2, 1, height_ratios=[height, _SPECTRA_INCH])
+        parts = [figure.add_subfigure(grid[row]) for row in range(2)]
     axes = parts[0].add_subplot()
     axes.plot(longitude, latitude, color="#BBBBBB", linewidth=0.5, zorder=1)
     _draw_colours(axes, longitude[known], latitude[known], values[known], label, shape < 0.8)
