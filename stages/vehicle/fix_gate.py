@@ -55,7 +55,7 @@ def fix_outliers(
     Each is held against the robust line through it and three on either side: medians of their
     velocities and of their offsets. What may remain is half the greatest acceleration times the
     squared reach in time, and the noise: three `sigma` (n,) (m, NaN if unknown) or five robust
-    deviations of all. After that, of two places whose speed is impossible the later goes.
+    deviations of all. After that, places go that are too fast from both neighbours.
     """
     if way.seconds.size < 2 * _REACH + 1:
         return np.zeros(way.seconds.size, dtype=bool)
@@ -83,12 +83,16 @@ def _off_line(way: Way) -> tuple[Real, Real]:
 
 
 def _too_fast(way: Way, wrong: NDArray[np.bool_], max_speed: float) -> NDArray[np.bool_]:
-    kept = np.flatnonzero(~wrong)
-    distance = np.hypot(np.diff(way.east[kept]), np.diff(way.north[kept]))
-    fast = distance > max_speed * np.diff(way.seconds[kept])
+    """Places that are too far both from the place before and from the one after."""
     out = np.zeros(wrong.size, dtype=bool)
-    out[kept[1:][fast]] = True
-    return out
+    while True:
+        kept = np.flatnonzero(~(wrong | out))
+        distance = np.hypot(np.diff(way.east[kept]), np.diff(way.north[kept]))
+        fast = np.concatenate([[True], distance > max_speed * np.diff(way.seconds[kept]), [True]])
+        alone = kept[fast[1:] & fast[:-1]]
+        if not alone.size or kept.size < 3:
+            return out
+        out[alone] = True
 
 
 def stationary(way: Way, at: Real, *, speed: float, window_s: float) -> NDArray[np.bool_]:
@@ -99,5 +103,5 @@ def stationary(way: Way, at: Real, *, speed: float, window_s: float) -> NDArray[
     # At either end the first and last whole window.
     middle = np.clip(at, way.seconds[0] + half, way.seconds[-1] - half)
     inside = (at >= way.seconds[0]) & (at <= way.seconds[-1])
-    slow: NDArray[np.bool_] = np.linalg.norm(way.chord(middle, half), axis=1) < speed
-    return inside & slow
+    slow = np.linalg.norm(way.chord(middle, half), axis=1) < speed
+    return np.asarray(inside & slow, dtype=np.bool_)

@@ -68,10 +68,11 @@ def reduce_track(
     level = level + params.level_nt
     levelled = _with_level(reduced, anomaly - level, level, params)
     after = misfit(crossings.difference(anomaly - level))
-    _LOG.info(
-        "%d crossings: rms %.2f nT before levelling, %.2f after",
-        after.count, misfit(differences).rms, after.rms,
-    )  # fmt: skip
+    if after.count:
+        _LOG.info(
+            "%d crossings: rms %.2f nT before levelling, %.2f after",
+            after.count, misfit(differences).rms, after.rms,
+        )  # fmt: skip
     return levelled.assign_attrs(
         line_statistics=json.dumps([plain(line) for line in line_statistics(levelled)]),
         crossover_misfit=json.dumps(
@@ -127,7 +128,7 @@ def _warn_uncrossed(track: xr.Dataset, by_line: Real) -> None:
 
 def _plain(found: Misfit) -> dict[str, Any]:
     return {
-        name: None if isinstance(value, float) and np.isnan(value) else value
+        name: None if np.isnan(value) else round(value, 3)
         for name, value in dataclasses.asdict(found).items()
     }
 

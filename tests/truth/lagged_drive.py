@@ -6,6 +6,8 @@ soft iron; the attitude's stamps and the fixes' are late by known lags.
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
@@ -35,18 +37,25 @@ def speed(seconds: Real) -> Real:
     return 8.0 * np.clip((STANDS_FROM_S - seconds) / 10.0, 0.0, 1.0)
 
 
-def attitude(seconds: Real) -> Rotation:
+def attitude(seconds: Real, hills: float = 1.0) -> Rotation:
     """Body to north, east, down."""
-    moves = speed(seconds) / 8.0
+    moves = hills * speed(seconds) / 8.0
     pitch, roll = 0.06 * np.sin(seconds / 3.0) * moves, 0.04 * np.sin(seconds / 2.2) * moves
     return Rotation.from_euler("ZYX", np.stack([heading(seconds), pitch, roll], axis=1))
 
 
-def place(seconds: Real) -> tuple[Real, Real]:
-    """Latitude and longitude, degrees: the speed along the heading, summed in millisecond steps."""
+@functools.cache
+def _path() -> tuple[Real, Real, Real]:
+    """Seconds, metres north and east: the speed along the heading, summed by the millisecond."""
     fine = np.arange(0.0, DURATION_S + 5.0, 1e-3)
     north = np.cumsum(speed(fine) * np.cos(heading(fine))) * 1e-3
     east = np.cumsum(speed(fine) * np.sin(heading(fine))) * 1e-3
+    return fine, north, east
+
+
+def place(seconds: Real) -> tuple[Real, Real]:
+    """Latitude and longitude, degrees."""
+    fine, north, east = _path()
     per_latitude, per_longitude = metres_per_degree(np.array(ORIGIN[0]), 0.0)
     clipped = np.clip(seconds, 0.0, fine[-1])
     return (
@@ -55,6 +64,7 @@ def place(seconds: Real) -> tuple[Real, Real]:
     )
 
 
+@functools.cache
 def drive(
     *,
     attitude_lag_s: float = 0.0,
@@ -63,16 +73,17 @@ def drive(
     fix_noise_m: float = 0.0,
     attitude_noise_rad: float = 0.0,
     fix_rate_hz: float = 5.0,
+    hills: float = 1.0,
 ) -> xr.Dataset:
     """A track/1 of 50 Hz, with fixes and attitude samples (100 Hz) on their own dimensions."""
     rng = np.random.default_rng(6)
     seconds = np.arange(0.0, DURATION_S, 0.02)
     sampled = np.arange(-1.0, DURATION_S + 1.0, 0.01)
     fixed = np.arange(0.0, DURATION_S, 1.0 / fix_rate_hz)
-    turns = attitude(sampled) * Rotation.from_rotvec(
+    turns = attitude(sampled, hills) * Rotation.from_rotvec(
         attitude_noise_rad * rng.normal(size=(sampled.size, 3))
     )
-    body = attitude(seconds).inv().apply(FIELD_NED) @ MATRIX.T + BIAS
+    body = attitude(seconds, hills).inv().apply(FIELD_NED) @ MATRIX.T + BIAS
     body += field_noise_nt * rng.normal(size=body.shape)
     latitude, longitude = place(fixed)
     per_latitude, per_longitude = metres_per_degree(np.array(ORIGIN[0]), 0.0)
