@@ -40,7 +40,7 @@ $(RELEASES): release/%: % $(READY)
 	  $(MAGTILES) validate "$$(printf '%s' "$$built" | $(PATH_OF))"
 
 build/sample/demo.toml build/sample/world.toml: pipeline/sample.py pipeline/sample_model.py \
-  pipeline/synthetic_observatories.py $(READY)
+  pipeline/synthetic_observatories.py pipeline/sample_drives.py pipeline/sample_vehicles.py $(READY)
 	$(MAGTILES) sample $(@D)
 
 test: $(READY) ## Run the tests
