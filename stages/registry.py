@@ -21,7 +21,7 @@ from magtiles.stages.ingest import surface as ingest_surface
 from magtiles.stages.ingest.log import stage as log
 from magtiles.stages.ingest.observatory import stage as observatory
 from magtiles.stages.release import expect_total, tiles
-from magtiles.stages.road import features, merge, resample
+from magtiles.stages.road import features, match, merge, resample
 from magtiles.stages.temporal import assemble, baseline, check, diurnal, fit_fogm
 from magtiles.stages.vehicle import align, reduce
 from magtiles.stages.vehicle.calibration import apply as apply_calibration
@@ -44,6 +44,7 @@ STAGES: tuple[Stage, ...] = (
     resample.STAGE,
     merge.STAGE,
     features.STAGE,
+    match.STAGE,
     evaluate_model.STAGE,
     core_field.GRID_STAGE,
     core_field.TRACK_STAGE,

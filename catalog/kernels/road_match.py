@@ -60,20 +60,23 @@ class SectionMap:
     weight: Floats
     log_variance: Floats
 
-    def log_likelihood(self, section: Floats, start: int, stop: int) -> Floats:
+    def log_likelihood(
+        self, section: Floats, start: int, stop: int, out: Floats | None = None
+    ) -> Floats:
         """Log-likelihood of a section's first sample at each of the points start ... stop - 1.
 
         Parameters
         ----------
         section : (K, 3) nT at the map's spacing.
         start, stop : 0 <= start < stop <= points - K + 1.
+        out : (stop - start,) to fill, contiguous; new where not given.
         """
         from magtiles.catalog.kernels import road_match_compiled as kernels
 
         rows = np.ascontiguousarray(section.T, np.float64)
         if self.form == "differenced":
             rows = np.ascontiguousarray(np.diff(rows, axis=1))
-        answer = np.empty(stop - start)
+        answer = np.empty(stop - start) if out is None else out
         terms = rows.size - 3 * (self.form == "demeaned")
         kernel = kernels.demeaned if self.form == "demeaned" else kernels.measured
         kernel(self.field, self.weight, self.log_variance, rows, start, terms * _LOG_2PI, answer)

@@ -132,3 +132,19 @@ def _best_bin(share: Floats, run: NDArray[np.int64], bin_points: int) -> int:
         moment += share[first] * (last - first)
         first -= 1
     return last - round(moment / weight)
+
+
+@_compile
+def share_within(log_likelihood: Floats, position: Floats, place: int, squared: float) -> float:
+    """Share of all likelihood that points within a distance of the point `place` have."""
+    top, within, total = -math.inf, 0.0, 0.0
+    for s in range(log_likelihood.size):
+        top = max(top, log_likelihood[s])
+    for s in range(log_likelihood.size):
+        if log_likelihood[s] > top - _NEGLIGIBLE:
+            likely = math.exp(log_likelihood[s] - top)
+            y, x = position[s, 0] - position[place, 0], position[s, 1] - position[place, 1]
+            total += likely
+            if y * y + x * x <= squared:
+                within += likely
+    return within / total
