@@ -17,8 +17,8 @@ _DRIFT_M = 0.5
 """Standard deviation of the shift's change from one window to the next."""
 _CORRELATED_M = 5.0
 """Length over which differences of two passes are one piece of information."""
-_FLOOR_NT = 30.0
-"""Noise of a magnetometer; below it agreement says no more."""
+_FLOOR_NT = 100.0
+"""By which passes differ in any case, in lane and sensor: closer agreement says no more."""
 
 
 def shifts(
@@ -43,29 +43,30 @@ def shifts(
     centres = np.arange(distance[0], distance[-1] + _STEP_M, _STEP_M)
     spline = CubicSpline(pass_distance, pass_field)
     ends = pass_distance[0], pass_distance[-1]
-    log_likelihood = np.stack(
-        [_window_likelihood(distance, field, spline, ends, s, centres) for s in ladder], axis=1
-    )
+    found = [_misfit(distance, field, spline, ends, shift, centres) for shift in ladder]
+    variance, number = (np.stack(part, axis=1) for part in zip(*found, strict=True))
+    # Of the overlap that every shift has, so that none gains by having less to explain.
+    pieces = number.min(axis=1, keepdims=True) * float(np.median(np.diff(distance))) / _CORRELATED_M
+    log_likelihood = -0.5 * pieces * np.log(variance).sum(axis=2)
     log_likelihood -= 0.5 * (ladder / sigma_m) ** 2
     return np.interp(distance, centres, _posterior_mean(log_likelihood, ladder))
 
 
-def _window_likelihood(
+def _misfit(
     distance: Real, field: Real, spline: CubicSpline, ends: tuple[float, float], shift: float,
     centres: Real,
-) -> Real:  # fmt: skip
+) -> tuple[Real, Real]:  # fmt: skip
+    """Variance of the difference (window, 3) at one shift, and its points (window,)."""
     at = distance + shift
     inside = (at >= ends[0]) & (at <= ends[1])
     difference = np.where(inside[:, None], spline(np.clip(at, *ends)) - field, 0.0)
     low = np.searchsorted(distance, centres - _WINDOW_M / 2)
     high = np.searchsorted(distance, centres + _WINDOW_M / 2)
     number = _sums(inside.astype(np.float64), low, high)
-    total = _sums(difference, low, high)
-    square = _sums(difference**2, low, high)
     safe = np.maximum(number, 1.0)[:, None]
-    variance = (square - total**2 / safe) / safe + _FLOOR_NT**2
-    pieces = number * float(np.median(np.diff(distance))) / _CORRELATED_M
-    return np.asarray(-0.5 * pieces * np.log(variance).sum(axis=1))
+    mean = _sums(difference, low, high) / safe
+    variance = np.maximum(_sums(difference**2, low, high) / safe - mean**2, 0.0)
+    return variance + _FLOOR_NT**2, number
 
 
 def _sums(values: Real, low: NDArray[np.intp], high: NDArray[np.intp]) -> Real:

@@ -39,7 +39,8 @@ class Statistics:
             self.names.append(name)
             for key in ("number", "mean", "square_sum"):
                 values = getattr(self, key)
-                setattr(self, key, np.concatenate([values, np.zeros_like(values[:1])]))
+                empty = np.zeros((1, *values.shape[1:]), values.dtype)
+                setattr(self, key, np.concatenate([values, empty]))
         return self.names.index(name)
 
     def add(self, vehicle: int, field: Real, where: NDArray[np.bool_]) -> None:
@@ -112,7 +113,21 @@ def estimate(
     weight = np.where(there, 1.0 / np.maximum(variance, 1e-12), 0.0)
     total = weight.sum(axis=0)
     field = (weight * statistics.mean).sum(axis=0) / total
-    return Estimate(field, np.sqrt(1.0 / total), same, cross)
+    sigma = _student(there[..., 0]) * np.sqrt(1.0 / total)
+    return Estimate(field, sigma, same, cross)
+
+
+def _student(there: NDArray[np.bool_]) -> Real:
+    """Factor (point, 1) by which a standard deviation found from few vehicles is too small.
+
+    That of Student's distribution at 68 %, its degrees of freedom those of the vehicles and
+    one of what was stated; 1 where there is one vehicle, and all is stated.
+    """
+    from scipy.stats import norm, t
+
+    vehicles = there.sum(axis=0)
+    factor = t.ppf(norm.cdf(1.0), np.maximum(vehicles, 1))
+    return np.asarray(np.where(vehicles > 1, factor, 1.0))[:, None]
 
 
 def _around(values: Real, spacing_m: float) -> Real:

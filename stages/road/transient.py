@@ -51,7 +51,9 @@ def drop_transients(
     expected = _expected(statistics, vehicle)
     difference = _without_slow(field - expected, where & (before > 0), spacing_m)
     scale = _scale(expected, difference, where & (before > 0), spacing_m)
-    disputed = _disputed(statistics, scale, before, spacing_m)
+    # What two passes of which one is disturbed say is no measure: the new one is.
+    own_scale = _scale(np.where(where[:, None], field, expected), difference, where, spacing_m)
+    disputed = _disputed(statistics, own_scale, before, spacing_m)
     lone = _stretches(difference, scale, where & (before > 1) & ~disputed)
     dropped = lone.copy()
     for stretch in _runs(disputed & where):
