@@ -71,7 +71,7 @@ def find_crossings(track: xr.Dataset, *, apart_s: float = 60.0) -> Crossings:
     Parameters
     ----------
     track : with `latitude`, `longitude` and perhaps `line`, `quality_flag`.
-    apart_s : passes closer in time are one.
+    apart_s : passes of one line closer in time are one.
 
     Flagged samples, and segments across gaps, take no part.
     """
@@ -81,7 +81,7 @@ def find_crossings(track: xr.Dataset, *, apart_s: float = 60.0) -> Crossings:
     x = wrap_longitude(longitude - middle) * np.cos(np.radians(np.nanmedian(latitude)))
     rows = _segments(track, x, latitude, lines)
     seconds = (track["time"].values - track["time"].values[0]) / np.timedelta64(1, "s")
-    found = _cross(x, latitude, rows, seconds, apart_s)
+    found = _cross(x, latitude, rows, _Passes(lines, seconds, apart_s))
     first, second, first_share, second_share = found
     east = x[first] + first_share * (x[first + 1] - x[first])
     north = latitude[first] + first_share * (latitude[first + 1] - latitude[first])
@@ -110,9 +110,7 @@ def _segments(track: xr.Dataset, x: Real, y: Real, lines: NDArray[np.int64]) -> 
     return np.flatnonzero(path)
 
 
-def _cross(
-    x: Real, y: Real, rows: Rows, seconds: Real, apart_s: float
-) -> tuple[Rows, Rows, Real, Real]:
+def _cross(x: Real, y: Real, rows: Rows, passes: _Passes) -> tuple[Rows, Rows, Real, Real]:
     """Rows before each crossing in either pass, and shares of the segments."""
     none = np.zeros(0, dtype=np.intp), np.zeros(0)
     if rows.size < 2:
@@ -126,13 +124,27 @@ def _cross(
         inner = _inside(inner, _FINE, ends)
         # A pair of one box with itself holds each pair of its members twice.
         inner = np.unique(np.sort(inner, axis=1), axis=0)
-        apart = np.abs(seconds[rows[inner[:, 0]]] - seconds[rows[inner[:, 1]]]) >= apart_s
+        apart = passes.differ(rows[inner[:, 0]], rows[inner[:, 1]])
         found.append(inner[apart & (inner[:, 0] != inner[:, 1])])
     pairs = np.unique(np.concatenate(found), axis=0) if found else np.zeros((0, 2), np.intp)
     first, second = rows[pairs[:, 0]], rows[pairs[:, 1]]
     shares = _shares(x, y, first, second)
     inside = ((shares >= 0.0) & (shares < 1.0)).all(axis=1)
     return first[inside], second[inside], shares[inside, 0], shares[inside, 1]
+
+
+@dataclass(frozen=True)
+class _Passes:
+    """Lines and seconds (time,) of samples, and how far apart two passes of a line are."""
+
+    lines: NDArray[np.int64]
+    seconds: Real
+    apart_s: float
+
+    def differ(self, first: Rows, second: Rows) -> NDArray[np.bool_]:
+        """Which pairs of rows are of two passes."""
+        apart = np.abs(self.seconds[first] - self.seconds[second]) >= self.apart_s
+        return np.asarray(apart | (self.lines[first] != self.lines[second]))
 
 
 def _shares(x: Real, y: Real, first: Rows, second: Rows) -> Real:

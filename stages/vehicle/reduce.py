@@ -34,7 +34,7 @@ class ReduceTrackParams(RemoveCoreFieldParams):
     )
     level_nt: float = quantity("nT", default=0.0, doc="Constant that comes off besides.")
     crossings_apart_s: float = quantity(
-        "s", default=60.0, gt=0, doc="Passes closer in time are no crossing."
+        "s", default=60.0, gt=0, doc="Passes of one line closer in time are no crossing."
     )
 
 
