@@ -1,0 +1,1 @@
+"""Point surveys of small areas as grids."""
