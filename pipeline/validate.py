@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magtiles.catalog import open_release
+from magtiles.catalog import Release, open_release
 from magtiles.catalog.flags import QualityFlag
 from magtiles.catalog.kernels.bspline import HALO
 from magtiles.catalog.releases.digest import array_digest
@@ -31,7 +31,8 @@ from magtiles.catalog.releases.tile_table import LEVELS, UNITS
 from magtiles.pipeline.artifacts import open_artifact
 from magtiles.pipeline.overlaps import Overlaps
 from magtiles.pipeline.physics import GradientSums, add_gradients, projection_excess
-from magtiles.pipeline.temporal_checks import check_temporal
+from magtiles.pipeline.road_checks import check_roads
+from magtiles.pipeline.temporal_checks import Finding, check_temporal
 from magtiles.schemas import contracts
 from magtiles.schemas.errors import MagtilesError
 from magtiles.stages.release.checks import CHECKS_NAME, TOLERANCE, replay_checks
@@ -83,7 +84,9 @@ def validate_release(
     checks.append(_check_units(manifest))
     checks += _check_tiles(folder, manifest)
     if manifest.temporal is not None:
-        checks += _check_temporal(folder)
+        checks += _findings(folder, "temporal contract", check_temporal)
+    if manifest.roads:
+        checks += _findings(folder, "road contracts", check_roads)
     checks.append(_check_answers(folder))
     return checks
 
@@ -143,11 +146,14 @@ def _check_answers(folder: Path) -> Check:
     return Check(CHECKS_NAME, worst <= 1.0, worst, 1.0, "of tolerance", where)
 
 
-def _check_temporal(folder: Path) -> list[Check]:
+def _findings(
+    folder: Path, name: str, check: Callable[[Release], Iterator[Finding]]
+) -> list[Check]:
+    """Findings as checks; `name` fails when the part cannot be read at all."""
     try:
-        return [Check(**vars(finding)) for finding in check_temporal(open_release(folder))]
+        return [Check(**vars(finding)) for finding in check(open_release(folder))]
     except MagtilesError as problem:
-        return [Check("temporal contract", False, None, None, "", str(problem))]
+        return [Check(name, False, None, None, "", str(problem))]
 
 
 def _counted(name: str, problems: list[str], unit: str, fine: str) -> Check:

@@ -46,7 +46,10 @@ def run(arguments: argparse.Namespace) -> int:
     release = open_release(arguments.release)
     for file in release.manifest.files:
         release.file(file.path)
-    described = describe(release.manifest) | {"temporal": describe_temporal(release)}
+    described = describe(release.manifest) | {
+        "temporal": describe_temporal(release),
+        "roads": describe_roads(release),
+    }
     if arguments.json:
         print_json(described)
     else:
@@ -98,6 +101,26 @@ def describe_temporal(release: Release) -> dict[str, Any] | None:
         "segments": 0 if segments is None else int(segments.size),
         "array_digest": release.manifest.temporal.array_digest,
     }
+
+
+def describe_roads(release: Release) -> list[dict[str, Any]]:
+    """The road maps of a release; none without."""
+    if not release.manifest.roads:
+        return []
+    return [
+        {
+            "name": road.name,
+            "length_m": road.length_m,
+            "spacing_m": road.spacing_m,
+            "passes": int(road.variables["pass_name"].size),
+            "vehicles": list(road.vehicles),
+            "calibrated": road.calibrated,
+            "features": len(road.features),
+            "matchability": road.matchability,
+            "array_digest": release.manifest.roads[road.name].array_digest,
+        }
+        for road in release.roads.values()
+    ]
 
 
 def _wrapped(longitude: float) -> float:
@@ -157,6 +180,9 @@ def _print_described(about: dict[str, Any]) -> None:
     if about["temporal"] is not None:
         _print_temporal(about["temporal"])
         print()
+    if about["roads"]:
+        _print_roads(about["roads"])
+        print()
     shares = [(f"{share:.2%}", name) for name, share in about["flag_fractions"].items()]
     print_table(("nodes", "flag"), shares)
     print()
@@ -185,6 +211,21 @@ def _print_temporal(temporal: dict[str, Any]) -> None:
     months = temporal["months"]
     span = f"{months[0]} to {months[-1]}" if months else "none"
     print(f"quiet-day curves: {span} ({len(months)}); FOGM segments: {temporal['segments']}")
+
+
+def _print_roads(roads: list[dict[str, Any]]) -> None:
+    rows = [
+        (
+            r["name"],
+            f"{r['length_m']:.0f} every {r['spacing_m']:g}",
+            str(r["passes"]),
+            ", ".join(r["vehicles"]),
+            "yes" if r["calibrated"] else "no",
+            "-" if r["matchability"] is None else f"{r['matchability']:.2f}",
+        )
+        for r in roads
+    ]
+    print_table(("road", "length m", "passes", "vehicles", "calibrated", "matchability"), rows)
 
 
 def _print_next(manifest: Manifest, folder: Path) -> None:

@@ -51,7 +51,7 @@ def rows(found: xr.Dataset) -> list[dict[str, object]]:
             found["form"].values.tolist(),
             found["method"].values.tolist(),
             strict=True,
-        )  # fmt: skip
+        )
     )
     made = []
     for key in dict.fromkeys(keys):
@@ -76,7 +76,7 @@ def rows(found: xr.Dataset) -> list[dict[str, object]]:
 
 def main() -> None:
     """Print one table for calibrated and one for uncalibrated drives."""
-    head = "| pairs | spacing m | section m | samples | method | within 3 m | 10 m | 20 m | available |"
+    head = "| pairs | spacing m | section m | samples | method | 3 m | 10 m | 20 m | available |"
     for calibrated in (True, False):
         print(f"\n{'calibrated' if calibrated else 'uncalibrated'}, percent\n\n{head}")
         print("|---|---|---|---|---|---|---|---|---|")
