@@ -72,7 +72,7 @@ class Motion:
         """Whether the vehicle moved at each time: both nodes around it do."""
         after = np.clip(np.searchsorted(self.seconds, seconds), 1, len(self.seconds) - 1)
         inside = (seconds >= self.seconds[0]) & (seconds <= self.seconds[-1])
-        return inside & ~(self.still[after] & self.still[after - 1])
+        return np.asarray(inside & ~(self.still[after] & self.still[after - 1]))
 
 
 def motion_of(track: xr.Dataset, *, position_sigma_m: float, standstill_m_s: float) -> Motion:

@@ -39,7 +39,7 @@ def shifts(
     """
     reach = _REACH * sigma_m
     count = 2 * int(np.ceil(reach / _CANDIDATE_M)) + 1
-    ladder = _CANDIDATE_M * (np.arange(count) - count // 2)
+    ladder: Real = _CANDIDATE_M * (np.arange(count, dtype=np.float64) - count // 2)
     centres = np.arange(distance[0], distance[-1] + _STEP_M, _STEP_M)
     spline = CubicSpline(pass_distance, pass_field)
     ends = pass_distance[0], pass_distance[-1]
@@ -49,7 +49,7 @@ def shifts(
     pieces = number.min(axis=1, keepdims=True) * float(np.median(np.diff(distance))) / _CORRELATED_M
     log_likelihood = -0.5 * pieces * np.log(variance).sum(axis=2)
     log_likelihood -= 0.5 * (ladder / sigma_m) ** 2
-    return np.interp(distance, centres, _posterior_mean(log_likelihood, ladder))
+    return np.interp(distance, centres, _posterior_mean(np.asarray(log_likelihood), ladder))
 
 
 def _misfit(

@@ -74,7 +74,7 @@ def most_probable_path(seen: Observed) -> Path:
     The first rounds hold the fixes alone, so that the course is known before the wheels,
     which measure speed along it, are used.
     """
-    fixed = np.isfinite(seen.place).all(axis=1)
+    fixed: Mask = np.asarray(np.isfinite(seen.place).all(axis=1))
     weight = np.where(fixed, 1.0, 0.0)
     course: Real | None = None
     scale = np.nan

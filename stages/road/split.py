@@ -226,8 +226,9 @@ def _named(
         if road == len(firsts):
             firsts.append((place, course))
         start, end = np.interp([low, high], motion.distance[going], motion.seconds[going])
-        utc = [motion.start + np.timedelta64(int(s * 1e9), "ns") for s in (start, end)]
-        parts.append(DrivePart(float(start), float(end), *utc, float(high - low), road, direction))
+        first, last = (motion.start + np.timedelta64(int(1e9 * s), "ns") for s in (start, end))
+        length = float(high - low)
+        parts.append(DrivePart(float(start), float(end), first, last, length, road, direction))
     return parts
 
 
