@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from magtiles.catalog.flags import QualityFlag
 from magtiles.catalog.kernels.bspline import Floats
 from magtiles.catalog.kernels.vertical import FAMILIES
+from magtiles.catalog.releases import level_curve
+from magtiles.catalog.releases.level_curve import LevelPoint, PathMatch
 from magtiles.catalog.releases.manifest import Manifest
 from magtiles.catalog.releases.positions import (
     Nodes,
@@ -192,6 +194,49 @@ class Anomaly:
         # Any height will do: only the surface is asked for.
         at = locate(self._manifest, self._nodes, latitude, longitude, 0.0, None)
         return _shaped(at, np.where(at.inside, -at.relative, np.nan))
+
+    def nearest_on_level_curve(
+        self,
+        value: float,
+        latitude: float,
+        longitude: float,
+        height: float | None = None,
+        *,
+        within_m: float,
+        height_above_reference: float | None = None,
+    ) -> LevelPoint:
+        """The place nearest to a position where the total is `value`, nT, at that height.
+
+        See `level_curve.nearest_on_level_curve`; NaN where there is none within `within_m`.
+        """
+
+        def total(lat: Floats, lon: Floats) -> Floats:
+            return self.total(lat, lon, height, height_above_reference=height_above_reference)
+
+        return level_curve.nearest_on_level_curve(total, value, latitude, longitude, within_m)
+
+    def mean_absolute_deviation(
+        self,
+        values: ArrayLike,
+        latitude: ArrayLike,
+        longitude: ArrayLike,
+        height: float | None = None,
+        *,
+        half_width_m: float,
+        step_m: float,
+        height_above_reference: float | None = None,
+    ) -> PathMatch:
+        """How measured totals (n,), nT, fit along a path (n,) and parallels to it.
+
+        See `level_curve.mean_absolute_deviation`.
+        """
+
+        def total(lat: Floats, lon: Floats) -> Floats:
+            return self.total(lat, lon, height, height_above_reference=height_above_reference)
+
+        return level_curve.mean_absolute_deviation(
+            total, values, latitude, longitude, half_width_m, step_m
+        )
 
     def patch(
         self,

@@ -18,8 +18,10 @@ from magtiles.catalog.kernels import compiled
 from magtiles.catalog.kernels.bspline import HALO, Floats, prefilter
 from magtiles.catalog.kernels.geodesy import metres_per_degree
 from magtiles.catalog.kernels.hermite import bracket
+from magtiles.catalog.releases import level_curve
 from magtiles.catalog.releases.anomaly import Anomaly
 from magtiles.catalog.releases.arguments import broadcast, check_positions, numbers
+from magtiles.catalog.releases.level_curve import LevelPoint, PathMatch
 from magtiles.catalog.releases.manifest import Manifest
 from magtiles.catalog.releases.patch_nodes import Bounds, FlatNodes, PatchNodes, window_of
 from magtiles.catalog.releases.positions import Nodes, choose_height
@@ -69,6 +71,26 @@ class Patch:
     def tensor(self, latitude: ArrayLike, longitude: ArrayLike) -> Floats:
         """Gradient tensor nn, ne, nd, ee, ed, nT/km; shape (..., 5)."""
         return self._anomaly.tensor(latitude, longitude, **self._height)
+
+    def nearest_on_level_curve(
+        self, value: float, latitude: float, longitude: float, *, within_m: float
+    ) -> LevelPoint:
+        """The place nearest to a position where the total is `value`, nT."""
+        return level_curve.nearest_on_level_curve(self.total, value, latitude, longitude, within_m)
+
+    def mean_absolute_deviation(
+        self,
+        values: ArrayLike,
+        latitude: ArrayLike,
+        longitude: ArrayLike,
+        *,
+        half_width_m: float,
+        step_m: float,
+    ) -> PathMatch:
+        """How measured totals (n,), nT, fit along a path (n,) and parallels to it."""
+        return level_curve.mean_absolute_deviation(
+            self.total, values, latitude, longitude, half_width_m, step_m
+        )
 
 
 class _TotalKernel:
