@@ -97,7 +97,7 @@ def part_of(motion: Motion, track: xr.Dataset, params: SplitParams, number: int)
         for i, p in enumerate(parts)
     )
     raise ParameterError(
-        f"part is {number}, and the drive has {len(parts)} parts ({listed})",
+        f"part is {number}, and the parts of the drive are ({listed})",
         where=track.attrs.get("source"),
         expected=f"0 to {len(parts) - 1}",
     )
