@@ -3,7 +3,8 @@
 What ``ingest-log`` hands on, and later stages may rely on:
 
 - `time` is UTC and ascends. Rows recorded after a clock went back, or twice, are sorted in and
-  carry ``TrackFlag.CLOCK_STEP``; without them time strictly ascends.
+  carry ``TrackFlag.CLOCK_STEP`` (of tables the fewest rows that break the order of a line); without
+  them time strictly ascends.
 - `field_body` (time, axis) is nT in the body frame forward, right, down once the source's
   `sensor_to_body` is applied, else in the sensor's axes as written; `field_total` is nT.
   ``FIELD_GAP`` marks rows without a field.
@@ -21,5 +22,7 @@ What ``ingest-log`` hands on, and later stages may rely on:
   They are the antenna's.
 - Attitude samples stay on dimension `attitude_sample`: `attitude_time`, `attitude_quaternion`,
   and `angular_rate` (attitude_sample, axis) in rad/s about the body axes, NaN if unknown.
-- Formats whose rows carry their own position (survey lines) have neither dimension.
+- Formats whose rows carry their own position (survey lines) have neither dimension. The survey's
+  own columns that the source names are kept as ``source_<name>``, in the units it states.
+- `sensor_to_body` (attribute, nine numbers by rows) is there once it was applied.
 """
