@@ -66,7 +66,9 @@ def bracket(levels: Floats, heights: Floats) -> Bracket:
     """Weights of `levels` (ascending, metres) at `heights` (n,) above the same surface."""
     near = np.clip(np.searchsorted(levels, heights + LEVEL_TOLERANCE_M, "right") - 1, 0, None)
     gain = heights - levels[near]
-    gain = np.where(np.abs(gain) <= LEVEL_TOLERANCE_M, 0.0, gain)
+    # The sum above is rounded: what it lifts to a level is on that level, not below the lowest.
+    on_level = (np.abs(gain) <= LEVEL_TOLERANCE_M) | ((gain < 0.0) & (near > 0))
+    gain = np.where(on_level, 0.0, gain)
     last = len(levels) - 1
     below, above = gain < 0.0, (near == last) & (gain > 0.0)
     between = (gain > 0.0) & ~above

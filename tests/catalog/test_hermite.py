@@ -25,7 +25,8 @@ def test_reproduces_polynomials_of_the_fifth_degree() -> None:
 
 
 @pytest.mark.parametrize(
-    ("height", "level"), [(0.0, 0), (1000.0, 1), (2000.0 + 9e-7, 2), (4000.0, 3)]
+    ("height", "level"),
+    [(0.0, 0), (1000.0, 1), (2000.0 + 9e-7, 2), (2000.0 - 1e-6, 2), (4000.0, 3)],
 )
 def test_on_a_level_only_that_level_counts(height: float, level: int) -> None:
     around = bracket(LEVELS, np.array([height]))
