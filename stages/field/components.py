@@ -24,7 +24,7 @@ from magtiles.stages.field.spectral import (
 )
 from magtiles.stages.field.surface import surface_at
 from magtiles.stages.field.target import Axis, Nodes, Target, geographic_target, locate, own_target
-from magtiles.stages.field.uncertainty import uncertainty
+from magtiles.stages.field.uncertainty import budget, survey_variance
 
 Single = NDArray[np.float32]
 
@@ -86,7 +86,8 @@ def derive_components(grid: xr.Dataset, *, params: DeriveComponentsParams) -> xr
     axes = params.latitude, params.longitude
     nodes = latest("nodes", (key, angles, axes), lambda: locate(target, plane_map, ambient))
     products = evaluate_products(field, nodes, params.height_m)
-    sigmas = uncertainty(grid, plane_map, field, params.height_m, nodes.row, nodes.column)
+    survey = survey_variance(plane_map, nodes.row, nodes.column)
+    sigmas = budget(grid, plane_map, field, params.height_m).sigma(survey, nodes.row, nodes.column)
     flags = quality_flags(plane_map, nodes, params.height_m)
     return _assemble(grid, target, nodes, params.height_m, products, sigmas, flags)
 

@@ -18,7 +18,6 @@ from magtiles.stages.field.interpolate import evaluate_linear
 from magtiles.stages.field.padding import Padding, pad
 from magtiles.stages.field.prepare import PlaneMap
 from magtiles.stages.field.product import Level
-from magtiles.stages.field.solve import AnomalousField
 from magtiles.stages.field.spectral import (
     TENSOR,
     VECTOR,
@@ -62,10 +61,47 @@ class MissingData:
         return out
 
 
-def missing_data(plane_map: PlaneMap, field: AnomalousField, height_gain: float) -> MissingData:
-    """Errors for want of data, `height_gain` m above the map, by Monte Carlo (fixed seed)."""
-    thinning = int(np.ceil(max(plane_map.values.shape) / _LARGEST))
-    experiment = _Experiment.of(plane_map, field, thinning)
+@dataclass(frozen=True)
+class ThinMap:
+    """A map thinned by means over blocks of `thinning` nodes a side.
+
+    `values` nT; `void` and `beyond`, what part of each block is filled and outside; `spacing`
+    of the map itself, m; `noise_variance` of one of its nodes, nT^2.
+    """
+
+    values: Real
+    void: Real
+    beyond: Real
+    thinning: int
+    spacing: tuple[float, float]
+    noise_variance: float
+
+
+def thinning_of(shape: tuple[int, int]) -> int:
+    """How many nodes of a map of that shape go into one of its thin copy, each way."""
+    return int(np.ceil(max(shape) / _LARGEST))
+
+
+def thin_map(plane_map: PlaneMap) -> ThinMap:
+    """The thin copy of a map that `missing_data` is measured on."""
+    thinning = thinning_of((plane_map.values.shape[0], plane_map.values.shape[1]))
+    parts = (plane_map.values, plane_map.void, plane_map.beyond)
+    return ThinMap(
+        *(_thin(part, thinning) for part in parts),
+        thinning,
+        plane_map.spacing,
+        float(np.mean(plane_map.sigma**2)),
+    )
+
+
+def missing_data(
+    thin: ThinMap, padding: Padding, direction: tuple[float, float, float], height_gain: float
+) -> MissingData:
+    """Errors for want of data, `height_gain` m above a map, by Monte Carlo (fixed seed).
+
+    `padding` is the map's own, `direction` (y, x, d) its mean ambient direction.
+    """
+    experiment = _Experiment.of(thin, padding, direction)
     random = np.random.Generator(np.random.PCG64(_SEED))
     totals: dict[str, Real] = {}
     for _ in range(REALISATIONS):
@@ -77,7 +113,7 @@ def missing_data(plane_map: PlaneMap, field: AnomalousField, height_gain: float)
         group: ndimage.gaussian_filter(total * gap_power, width, mode="nearest")
         for group, total in totals.items()
     }
-    return MissingData({**variance, "roughness": typical_power}, thinning)
+    return MissingData({**variance, "roughness": typical_power}, thin.thinning)
 
 
 @dataclass(frozen=True)
@@ -99,23 +135,27 @@ class _Experiment:
         return self.inversion.wavenumbers
 
     @classmethod
-    def of(cls, plane_map: PlaneMap, field: AnomalousField, thinning: int) -> _Experiment:
-        void, beyond = (_thin(m, thinning) > 0.5 for m in (plane_map.void, plane_map.beyond))
+    def of(
+        cls, thin: ThinMap, map_padding: Padding, direction: tuple[float, float, float]
+    ) -> _Experiment:
+        void, beyond = thin.void > 0.5, thin.beyond > 0.5
         gaps = void | beyond
-        values = _thin(plane_map.values, thinning)
-        spacing = plane_map.spacing[0] * thinning, plane_map.spacing[1] * thinning
-        before = [int(np.ceil(o / thinning)) for o in field.padding.offset]
+        values, thinning = thin.values, thin.thinning
+        spacing = thin.spacing[0] * thinning, thin.spacing[1] * thinning
+        before = [int(np.ceil(o / thinning)) for o in map_padding.offset]
         shape = [odd_fast_length(n + 2 * o) for n, o in zip(values.shape, before, strict=True)]
-        padding = Padding((before[0], before[1]), values.shape, (shape[0], shape[1]))
-        inversion = Inversion(Wavenumbers(padding.shape, spacing), field.inversion.direction)
-        noise = float(np.mean(plane_map.sigma**2)) / thinning**2
+        padding = Padding(
+            (before[0], before[1]), (values.shape[0], values.shape[1]), (shape[0], shape[1])
+        )
+        inversion = Inversion(Wavenumbers(padding.shape, spacing), direction)
+        noise = thin.noise_variance / thinning**2
         return cls(
             values,
             gaps,
             void,
             beyond,
             distance_to(~gaps, spacing),
-            exterior_taper(plane_map.spacing),
+            exterior_taper(thin.spacing),
             padding,
             inversion,
             _amplitude(values, gaps, inversion, noise),

@@ -8,7 +8,7 @@ found by substitution from B = 0 on. Each round gains about the relative size of
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,7 +84,7 @@ def solve(plane_map: PlaneMap, ambient: AmbientSource, padding: Padding) -> Anom
     inversion = Inversion(wavenumbers, (float(mean[0]), float(mean[1]), float(mean[2])))
     padded = pad(plane_map.values, padding)
     variation = [part - m for part, m in zip(directions, mean, strict=True)]
-    total = _substitute(padded, padding, inversion, variation)
+    total = follow(padded, inversion, variation, padding.offset, padding.map_shape)
     signal, noise = float(plane_map.values.var()), float(np.mean(plane_map.sigma**2))
     noise_to_signal = noise / signal if noise < signal else 1.0
     return AnomalousField(padding, wavenumbers, inversion, total, noise_to_signal)
@@ -99,10 +99,18 @@ def _coarse_directions(plane_map: PlaneMap, ambient: AmbientSource) -> Direction
     return plane_direction(plane_map.plane, ambient)(*np.meshgrid(y, x, indexing="ij"))
 
 
-def _substitute(
-    padded: Real, padding: Padding, inversion: Inversion, variation: list[Real]
+def follow(
+    padded: Real,
+    inversion: Inversion,
+    variation: Sequence[Real],
+    offset: tuple[float, float],
+    shape: tuple[float, float],
 ) -> Complex:
-    """Spectrum of T - df.B, by substitution until a further round would change it by 0.1 %."""
+    """Spectrum of T - df.B, by substitution until a further round would change it by 0.1 %.
+
+    `variation` holds the parts of df on a coarse lattice that covers `shape` nodes of `padded`
+    from `offset` on, from corner to corner; it goes on unchanged beyond them.
+    """
     total = forward(padded)
     size = float(np.linalg.norm(padded - padded.mean()))
     if size == 0.0 or max(np.abs(part).max() for part in variation) < _TOLERANCE / 10:
@@ -110,7 +118,7 @@ def _substitute(
     previous = np.zeros(padded.shape)
     change = first = np.inf
     for _ in range(_ROUNDS):
-        correction = _varying_part(total, padding, inversion, variation)
+        correction = _varying_part(total, inversion, variation, offset, shape)
         last, change = change, float(np.linalg.norm(correction - previous)) / size
         if change > last:
             _log.warning(
@@ -126,20 +134,28 @@ def _substitute(
 
 
 def _varying_part(
-    total: Complex, padding: Padding, inversion: Inversion, variation: list[Real]
+    total: Complex,
+    inversion: Inversion,
+    variation: Sequence[Real],
+    offset: tuple[float, float],
+    shape: tuple[float, float],
 ) -> Real:
-    """df.B (nT) on the padded plane; df is held constant beyond the map's border."""
-    out = np.zeros(padding.shape)
+    """df.B (nT) on the padded plane."""
+    out = np.zeros(inversion.wavenumbers.shape)
     surface = Level(total, inversion, 0.0)
     for axis, part in zip(VECTOR, variation, strict=True):
         values = surface.values(axis, slice(None), slice(None))
-        add_product(out, values, part, padding.offset, padding.map_shape)
+        add_product(out, values, part, offset, shape)
     return out
 
 
 @njit(parallel=True, cache=True, nogil=True)
 def add_product(
-    out: Real, values: Single, factor: Real, offset: tuple[int, int], shape: tuple[int, int]
+    out: Real,
+    values: Single,
+    factor: Real,
+    offset: tuple[float, float],
+    shape: tuple[float, float],
 ) -> None:
     """Add values * factor to `out` (m, n).
 

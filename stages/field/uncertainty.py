@@ -8,13 +8,16 @@ second and third are larger where the map is rough.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+
 import numpy as np
 import xarray as xr
 from numba import njit
 from numpy.typing import NDArray
 
 from magtiles.stages.field.interpolate import evaluate_linear
-from magtiles.stages.field.missing import missing_data
+from magtiles.stages.field.missing import MissingData, missing_data, thin_map
 from magtiles.stages.field.prepare import PlaneMap
 from magtiles.stages.field.solve import AnomalousField
 from magtiles.stages.field.spectral import TENSOR, VECTOR, Inversion, fade
@@ -26,42 +29,69 @@ _FLOOR = {"total": 1e-3, "vector": 1e-3, "tensor": 1e-6}
 _PER_KM2 = 1e6
 
 
-def uncertainty(
-    grid: xr.Dataset,
-    plane_map: PlaneMap,
-    field: AnomalousField,
-    height_gain: float,
-    row: Real,
-    column: Real,
-) -> dict[str, Real]:
-    """Sigma of each product group at fractional rows and columns of the map.
+@dataclass(frozen=True)
+class Budget:
+    """The parts of a level's uncertainty that hold for the whole map.
 
-    "total" and "vector" in nT, "tensor" in nT/km; vector and tensor per component, rms over
-    the components. Shapes those of `row`.
+    Attributes
+    ----------
+    noise, alias : variance of each group per unit variance of the survey's noise, and of its
+        anomaly.
+    faded : mean square of what the window takes of each group.
+    signal : variance of the anomaly where it was measured, nT^2.
+    missing : variance for want of data.
     """
-    missing = missing_data(plane_map, field, height_gain)
-    noise = noise_gain(field, height_gain)
-    faded = faded_power(field, height_gain, float(np.mean(plane_map.sigma**2)))
-    alias = alias_gain(grid, field.inversion, height_gain)
-    survey = _sample(plane_map.sigma, row, column) ** 2
-    signal = float(np.var(plane_map.values[~(plane_map.void | plane_map.beyond)]))
-    rough = missing.at("roughness", row, column)
-    return {
-        group: np.sqrt(
-            survey * noise[group]
-            + rough * (faded[group] + signal * alias[group])
-            + missing.at(group, row, column)
-            + _FLOOR[group] ** 2
-        )
-        for group in GROUPS
-    }
+
+    noise: Mapping[str, float]
+    faded: Mapping[str, float]
+    alias: Mapping[str, float]
+    signal: float
+    missing: MissingData
+
+    def sigma(self, survey: Real, row: Real, column: Real) -> dict[str, Real]:
+        """Sigma of each product group at fractional rows and columns of the map.
+
+        `survey`: variance of the survey's own values there, nT^2. "total" and "vector" in nT,
+        "tensor" in nT/km; vector and tensor per component, rms over the components.
+        """
+        rough = self.missing.at("roughness", row, column)
+        return {
+            group: np.sqrt(
+                survey * self.noise[group]
+                + rough * (self.faded[group] + self.signal * self.alias[group])
+                + self.missing.at(group, row, column)
+                + _FLOOR[group] ** 2
+            )
+            for group in GROUPS
+        }
+
+
+def budget(
+    grid: xr.Dataset, plane_map: PlaneMap, field: AnomalousField, height_gain: float
+) -> Budget:
+    """The uncertainty of a map that was transformed at once, `height_gain` m above it."""
+    noise_variance = float(np.mean(plane_map.sigma**2))
+    measured = plane_map.values[~(plane_map.void | plane_map.beyond)]
+    direction = field.inversion.direction
+    return Budget(
+        noise_gain(field, height_gain),
+        faded_power(field, height_gain, noise_variance),
+        alias_gain(grid, field.inversion, height_gain),
+        float(np.var(measured)),
+        missing_data(thin_map(plane_map), field.padding, direction, height_gain),
+    )
+
+
+def survey_variance(plane_map: PlaneMap, row: Real, column: Real) -> Real:
+    """Variance of the survey's own values (nT^2) at fractional rows and columns of a map."""
+    return np.asarray(_sample(plane_map.sigma, row, column) ** 2)
 
 
 def noise_gain(field: AnomalousField, height_gain: float) -> dict[str, float]:
     """Variance of each group per unit variance of white noise on the map's nodes (Parseval)."""
     w = field.wavenumbers
     lift = w.continuation(height_gain, field.noise_to_signal) ** 2
-    return _group_means(field, lift)
+    return group_means(field.inversion, lift)
 
 
 def faded_power(
@@ -71,16 +101,21 @@ def faded_power(
 
     From the map's own spectrum; what the window fades of the survey's noise is no loss.
     """
-    w = field.wavenumbers
-    lost = ((1.0 - w.window) * np.exp(-w.k * max(height_gain, 0.0))) ** 2
     interior = field.padding.map_shape[0] * field.padding.map_shape[1]
     power = np.abs(field.total) ** 2 / interior - noise_variance
-    return {group: max(mean, 0.0) for group, mean in _group_means(field, lost * power).items()}
+    return lost_power(field.inversion, power, height_gain)
 
 
-def _group_means(field: AnomalousField, total_power: Real) -> dict[str, float]:
+def lost_power(inversion: Inversion, power: Real, height_gain: float) -> dict[str, float]:
+    """Mean square of what the window takes from each group of a total of that spectral power."""
+    w = inversion.wavenumbers
+    lost = ((1.0 - w.window) * np.exp(-w.k * max(height_gain, 0.0))) ** 2
+    return {group: max(mean, 0.0) for group, mean in group_means(inversion, lost * power).items()}
+
+
+def group_means(inversion: Inversion, total_power: Real) -> dict[str, float]:
     """Mean variance of each group's components, from the spectral power of the total."""
-    w, inversion = field.wavenumbers, field.inversion
+    w = inversion.wavenumbers
     sums = group_sums(
         total_power, w.y[:, 0], w.x[0], w.multiplicity[0], inversion.direction, inversion.damping
     )
