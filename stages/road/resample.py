@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import xarray as xr
@@ -47,6 +47,9 @@ class ResampleParams(SplitParams):
     sampling_limit_m: float = quantity(
         "m", default=3.0, gt=0, doc="Samples further apart than this miss small features."
     )
+    direction: Literal["forward", "backward"] | None = quantity(
+        "1", default=None, doc="Which way along the role road; default the longer run."
+    )
     max_offset_m: float = quantity(
         "m", default=15.0, gt=0, doc="Distance across the road at which a pass has left it."
     )
@@ -78,9 +81,9 @@ def resample_by_distance(
     Distance is that of the most probable path (`smoother`); a standing vehicle adds nothing.
     Each point has the mean of the samples within half a spacing, or, flagged INTERPOLATED,
     what lies between its neighbours. With `road` distances are that road's, for the longest
-    run of the drive that keeps to it in either direction; without, they count from the start.
-    The uncertainty is the variation of Shockley (2012, table 4.1), or as stated: one pass has
-    none of its own.
+    run of the drive that keeps to it, in either direction or that asked for; without, they count
+    from the start. The uncertainty is the variation of Shockley (2012, table 4.1), or as stated:
+    one pass has none of its own.
 
     Raises ContractError for a track without a vector field or whose places jump, CoverageError
     for a drive that stands, is shorter than the spacing, has gaps, or does not keep to `road`.
@@ -146,9 +149,12 @@ def _distance_along(
     ]
     covered = [np.ptp(r[np.isfinite(r)]) if np.isfinite(r).any() else 0.0 for r in runs]
     backward = bool(covered[1] > covered[0])
-    if max(covered) < params.spacing_m:
+    if params.direction is not None:
+        backward = params.direction == "backward"
+    if covered[backward] < params.spacing_m:
+        way = f", driven {params.direction}" if params.direction else ""
         raise CoverageError(
-            f"the drive does not keep to road '{road.attrs['road']}'",
+            f"the drive does not keep to road '{road.attrs['road']}'{way}",
             where=track.attrs.get("source"),
             expected=f"a stretch within {params.max_offset_m:g} m of it",
             remedy="name another road, or leave out the role road to start a new one",
@@ -305,13 +311,12 @@ def _attributes(
     road: xr.Dataset | None, backward: bool, cells: Cells,
 ) -> dict[str, Any]:  # fmt: skip
     name = params.road or ("road" if road is None else str(road.attrs["road"]))
-    turned = backward != (road is not None and road.attrs["direction"] == "backward")
     attrs: dict[str, Any] = {
         "road": name,
         "spacing_m": params.spacing_m,
         "length_m": float(np.ptp(cells.distance)),
         "calibrated": "true" if _is_calibrated(track, params) else "false",
-        "direction": "backward" if turned else "forward",
+        "direction": "backward" if backward else "forward",
         "height_reference": str(track.attrs["height_reference"]),
         "heading_source": "attitude" if _has_attitude(track, drive.row) else "course",
         "source": str(track.attrs["source"]),

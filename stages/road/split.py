@@ -24,6 +24,9 @@ _TURN_M = 30.0
 _U_TURN_DEG = 150.0
 _U_TURN_M = 60.0
 _PARALLEL_DEG = 30.0
+_COURSE_STEPS = 5
+"""To either side, over which the course of a drive is compared with that of another visit: fixes
+that wander while a vehicle stands put a bend into its path."""
 _APART_WIDTHS = 3.0
 """Widths of the road driven between two visits of one place, at least."""
 _SHORTEST_M = 25.0
@@ -188,7 +191,8 @@ def _visits(shape: _Shape, params: SplitParams) -> Real:
         np.abs(np.diff(shape.distance[pairs], axis=1)[:, 0]) > _APART_WIDTHS * params.road_width_m
     )
     pairs = pairs[apart]
-    turn = np.abs((np.diff(shape.course[pairs], axis=1)[:, 0] + np.pi) % (2 * np.pi) - np.pi)
+    course = _chord_course(shape.place)
+    turn = np.abs((np.diff(course[pairs], axis=1)[:, 0] + np.pi) % (2 * np.pi) - np.pi)
     line = np.minimum(turn, np.pi - turn) < np.radians(_PARALLEL_DEG)
     along = np.zeros(len(shape.distance), dtype=np.bool_)
     along[pairs[line].ravel()] = True
@@ -197,6 +201,14 @@ def _visits(shape: _Shape, params: SplitParams) -> Real:
         if not along[number]:
             cuts.append(int(number))
     return shape.distance[np.array(cuts, dtype=np.intp)]
+
+
+def _chord_course(place: Real) -> Real:
+    """Course (n,) of the chord around each place (n, 2), radians."""
+    number = np.arange(len(place))
+    ahead = np.minimum(number + _COURSE_STEPS, len(place) - 1)
+    chord = place[ahead] - place[np.maximum(number - _COURSE_STEPS, 0)]
+    return np.asarray(np.arctan2(chord[:, 1], chord[:, 0]))
 
 
 def _run_ends(mask: NDArray[np.bool_]) -> NDArray[np.intp]:

@@ -163,6 +163,20 @@ def test_a_loop_keeps_its_origin() -> None:
     assert again.attrs["length_m"] == pytest.approx(road.attrs["length_m"], abs=3.0)
 
 
+@pytest.mark.parametrize("direction", ["forward", "backward"])
+def test_of_a_drive_out_and_back_either_way_can_be_asked_for(direction: str) -> None:
+    out_and_back = np.array([(0.0, 0.0), (400.0, 0.0), (400.0, 8.0), (0.0, 8.0)])
+    road = resample(follow(out_and_back), part=0)
+    made = resample(follow(out_and_back), road, direction=direction)
+    assert made.attrs["direction"] == direction
+    assert made.attrs["length_m"] == pytest.approx(400.0, abs=8.0)
+    # A map's direction is that along the road's distance, also where the road is such a map.
+    again = resample(follow(out_and_back), made, direction=direction)
+    assert again.attrs["direction"] == direction
+    with pytest.raises(CoverageError, match="'road', driven backward"):
+        resample(follow(out_and_back[:2]), road, direction="backward")
+
+
 def test_the_other_direction_follows_from_the_heading() -> None:
     track = drive(SHORT, trip=Trip(fix_drift_m=0.0, fix_noise_m=0.05, weave_m=0.0))
     yaw = np.interp(np.arange(track.sizes["time"]), *_yaw(track))

@@ -31,6 +31,11 @@ CASES = [
         [(0, "forward", 404), (0, "backward", 404)],
     ),
     Expect(
+        "U-turn, and a fix that wanders at a light",
+        [(0, 0), (200, 0), (203, 3), (400, 3), (400, -5), (0, -5)],
+        [(0, "forward", 405), (0, "backward", 405)],
+    ),
+    Expect(
         "two laps",
         BLOCK + BLOCK[1:],
         2 * [(0, "forward", 300), (1, "forward", 200), (2, "forward", 300), (3, "forward", 200)],
