@@ -114,6 +114,7 @@ BAD = [
         "a.dat line 2: column 'MAG' holds '4.8OOO500D+04'; expected a number of 14", "letters"),
     Bad([row(1)], DEFINITIONS.replace("F10.1", "Z10.1"), FormatError,
         "a.dfn line 4: the format of 'TIME' is 'Z10.1", "no Fortran"),
+    Bad([row(1)], "", FormatError, "a.dfn: the file is empty", "empty definitions"),
     Bad([row(1)], "<html>\n", FormatError, "a.dfn line 1: holds '<html>'; expected DEFN", "HTML"),
     Bad([row(1)], DEFINITIONS.splitlines()[0], FormatError, "a.dfn: defines no columns", "none"),
     Bad(["COMM only"], DEFINITIONS, FormatError, "a.dat: holds no rows of data", "no rows"),

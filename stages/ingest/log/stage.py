@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,21 +15,12 @@ from numpy.typing import NDArray
 from magtiles.catalog.flags import TrackFlag, flag_attributes
 from magtiles.schemas.errors import FormatError, SourceError
 from magtiles.stages.declare import FILES, Stage
-from magtiles.stages.ingest.log.aseg import read_aseg
-from magtiles.stages.ingest.log.delimited import read_csv
-from magtiles.stages.ingest.log.hdf5 import read_hdf5
-from magtiles.stages.ingest.log.mcap_log import read_mcap
+from magtiles.stages.ingest.log.files import data_file, read_log
 from magtiles.stages.ingest.log.order import out_of_order
 from magtiles.stages.ingest.log.raw import FieldSamples, RawLog
-from magtiles.stages.ingest.log.sniff import log_format
 from magtiles.stages.ingest.log.source import TRACK, IngestLogParams, rotation
-from magtiles.stages.ingest.log.table import Table
-from magtiles.stages.ingest.log.table_log import table_log
-from magtiles.stages.ingest.log.trackline import read_mgd77, read_mgd77t, read_trackline_csv
-from magtiles.stages.ingest.log.ulog import read_ulog
 from magtiles.stages.ingest.raw import nanotesla_per
 from magtiles.stages.ingest.source import locate_all, merge
-from magtiles.stages.ingest.unpack import unpacked
 from magtiles.stages.vehicle.positions import (
     Fixes,
     Positions,
@@ -44,20 +34,6 @@ from magtiles.stages.vehicle.positions import (
 
 _LOG = logging.getLogger(__name__)
 
-_READERS: dict[str, Callable[[Path, IngestLogParams], RawLog]] = {
-    "mcap": read_mcap,
-    "ulog": read_ulog,
-}
-_TABLES: dict[str, Callable[[Path, IngestLogParams, str], Table]] = {
-    "csv": read_csv,
-    "hdf5": read_hdf5,
-    "mgd77": read_mgd77,
-    "mgd77t": read_mgd77t,
-    "trackline": read_trackline_csv,
-}
-_DEFINITION = ".dfn"
-_BESIDE = (".des", ".met", ".txt", ".pdf", ".h77", ".h77t")
-"""Descriptions for people that may be named with the data; nothing is read of them."""
 _CREDIBLE_NT = 1e6
 """No sensor on a vehicle that could be calibrated reads more; the core field is 22,000-67,000."""
 
@@ -79,8 +55,8 @@ def ingest_log(files: Sequence[Path], *, params: IngestLogParams) -> xr.Dataset:
     """
     found, source = locate_all([Path(f) for f in files], TRACK)
     params = merge(params, source)
-    path, definition = _data_file(found)
-    raw = _read(path, definition, params)
+    path, definition = data_file(found)
+    raw = read_log(path, definition, params)
     if raw.rows:
         params = params.model_copy(update={"units": None})  # a table's columns are in nT by now
     where = str(path) if source is None else f"{source.path} [log]"
@@ -96,42 +72,6 @@ STAGE = Stage(
     output="track/1",
     run=ingest_log,
 )
-
-
-def _data_file(found: Sequence[Path]) -> tuple[Path, Path | None]:
-    """The file of data, and that of its definitions, if any."""
-    kinds = {path: _plain_suffix(path) for path in found}
-    definitions = [path for path, kind in kinds.items() if kind == _DEFINITION]
-    data = [p for p, kind in kinds.items() if kind not in (_DEFINITION, *_BESIDE)]
-    if len(data) != 1 or len(definitions) > 1:
-        raise SourceError(
-            f"{len(data)} data files: {', '.join(sorted(p.name for p in data)) or 'none'}, "
-            f"{len(definitions)} of definitions",
-            where="files",
-            expected="one file, with one of definitions where its format has them",
-            remedy="ingest each alone",
-        )
-    return data[0], definitions[0] if definitions else None
-
-
-def _plain_suffix(path: Path) -> str:
-    name = path.with_suffix("") if path.suffix.lower() in (".gz", ".xz") else path
-    return name.suffix.lower()
-
-
-def _read(path: Path, definition: Path | None, params: IngestLogParams) -> RawLog:
-    with contextlib.ExitStack() as stack:
-        plain = stack.enter_context(unpacked(path, params.member))
-        beside = plain.with_suffix(_DEFINITION)
-        if definition is None and plain != path and beside.is_file():
-            definition = beside  # of the same archive
-        if definition is not None:
-            defined = stack.enter_context(unpacked(definition))
-            return table_log(read_aseg(plain, defined, params, str(path)), params)
-        kind = log_format(plain)
-        if kind in _READERS:
-            return _READERS[kind](plain, params)
-        return table_log(_TABLES[kind](plain, params, str(path)), params)
 
 
 class _Assembly:

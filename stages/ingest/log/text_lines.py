@@ -61,8 +61,9 @@ class Lines:
 
     def count(self, byte: int) -> NDArray[np.int64]:
         """How often a byte occurs in each line (n,)."""
-        seen = np.concatenate([[0], np.cumsum(self.data == byte)])
-        return np.asarray(seen[self.stop] - seen[self.start], dtype=np.int64)
+        places = np.flatnonzero(self.data == byte)
+        begin, end = (np.searchsorted(places, at) for at in (self.start, self.stop))
+        return np.asarray(end - begin, dtype=np.int64)
 
     @property
     def quoted(self) -> bool:
@@ -79,6 +80,8 @@ class Lines:
 def read_lines(path: Path, where: str) -> Lines:
     """The lines of a file. Raises FormatError for one without any, or of binary data."""
     data = np.fromfile(path, dtype=np.uint8)
+    if not data.size:
+        raise FormatError("the file is empty", where=where, remedy="fetch it again")
     if (data == 0).any():
         raise FormatError(
             "holds binary data", where=f"{where} byte {int(np.argmax(data == 0))}", expected="text"
@@ -90,8 +93,10 @@ def read_lines(path: Path, where: str) -> Lines:
     stop = np.asarray(ends, dtype=np.int64).copy()
     returned = (stop > start) & (data[np.maximum(stop - 1, 0)] == _RETURN)
     stop[returned] -= 1
-    seen = np.concatenate([[0], np.cumsum(~np.isin(data, _BLANKS))])
-    filled = seen[stop] > seen[start]
+    filled = stop > start
+    blank = np.isin(data[np.minimum(start, data.size - 1)], _BLANKS) & filled
+    for row in np.flatnonzero(blank):
+        filled[row] = bool(data[start[row] : stop[row]].tobytes().strip(b" \t\r\x1a"))
     lines = Lines(data, start, stop, np.arange(1, stop.size + 1), where, ended).select(filled)
     if not lines.number.size:
         raise FormatError("holds no lines", where=where, remedy="fetch it again")
