@@ -60,7 +60,7 @@ TEMPORAL_VARIABLES: dict[str, TemporalVariable] = {
     "latitude": _place("degrees_north", "geodetic latitude"),
     "longitude": _place("degrees_east", "geodetic longitude"),
     "elevation": _place("m", "height above mean sea level"),
-    "dip_latitude": _place("degrees_north", "dip latitude, atan(tan(inclination) / 2)"),
+    "dip_latitude": _place("degree", "dip latitude, atan(tan(inclination) / 2)"),
     "element": TemporalVariable(("element",), ("str",), None, "element of the field"),
     "month": TemporalVariable(("month",), ("int64",), SECONDS, "start of the month"),
     "minute": TemporalVariable(("minute",), _FLOATS, "min", "local mean solar time"),

@@ -28,6 +28,11 @@ from magtiles.stages.release.atomic import atomic_path
 _CHUNK = 4096
 """Most values of a chunk along its last dimension."""
 _DEFLATE = 4
+_TOLD = {
+    "title": "quiet-day variations of the magnetic field, and statistics of what they leave",
+    "history": "fitted by magtiles to observatory records; how is in provenance.json",
+}
+_STANDARD_NAMES = ("latitude", "longitude")
 _SECOND, _DAY = np.timedelta64(1, "s"), np.timedelta64(1, "D")
 
 
@@ -48,7 +53,7 @@ def write_temporal(dataset: xr.Dataset, path: Path) -> None:
             )
     with atomic_path(path) as temporary, netCDF4.Dataset(temporary, "w", format="NETCDF4") as file:
         kept = {k: v for k, v in dataset.attrs.items() if k not in ("Conventions", "contract")}
-        _set_attributes(file, {**kept, "Conventions": "CF-1.11", "contract": CONTRACT})
+        _set_attributes(file, {**_TOLD, **kept, "Conventions": "CF-1.11", "contract": CONTRACT})
         for dimension in (d for d in MOST if d in dataset.sizes):
             file.createDimension(dimension, dataset.sizes[dimension])
         for name in names:
@@ -85,6 +90,8 @@ def _write_variable(file: Any, name: str, array: xr.DataArray) -> None:
     )
     kept = {k: v for k, v in array.attrs.items() if str(k).startswith("flag_")}
     own = {} if rule.units is None else {"units": rule.units}
+    if name in _STANDARD_NAMES:
+        own["standard_name"] = name
     if rule.units in (SECONDS, DAYS):
         own["calendar"] = "proleptic_gregorian"
     _set_attributes(variable, {**kept, "long_name": rule.long_name, **own})

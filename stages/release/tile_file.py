@@ -28,6 +28,8 @@ _HEIGHT_NAMES = {
 }
 """Height reference to the standard name that the CF table has for it."""
 
+_HISTORY = "cut by magtiles from maps of each level; how those were made is in provenance.json"
+
 
 def write_tile(dataset: xr.Dataset, path: Path, *, checked: bool = False) -> None:
     """Write a dataset of contract anomaly-tile/1 to `path`, which appears whole or not at all.
@@ -40,7 +42,9 @@ def write_tile(dataset: xr.Dataset, path: Path, *, checked: bool = False) -> Non
     if not checked:
         contracts.check(dataset, CONTRACT, where=path)
     with atomic_path(path) as temporary, netCDF4.Dataset(temporary, "w", format="NETCDF4") as file:
-        _set_attributes(file, dataset.attrs)
+        place = f"row {dataset.attrs['tile_row']}, column {dataset.attrs['tile_column']}"
+        told = {"title": f"magnetic anomaly tile, {place}", "history": _HISTORY}
+        _set_attributes(file, told | dict(dataset.attrs))
         for name in LEVELS:
             file.createDimension(name, dataset.sizes[name])
         for name in sorted(set(TILE_VARIABLES) & set(map(str, dataset.variables))):

@@ -119,7 +119,7 @@ def _unkeyed(merged: xr.Dataset, models: Sequence[xr.Dataset]) -> xr.Dataset:
                 result[variable] = whole.astype(stated.dtype)
             result[variable].attrs = dict(stated.attrs)
     count = result.sizes["observatory"]
-    result["dip_latitude"] = ("observatory", np.zeros(count), {"units": "degrees_north"})
+    result["dip_latitude"] = ("observatory", np.zeros(count), {"units": "degree"})
     return result
 
 

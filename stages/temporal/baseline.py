@@ -232,14 +232,13 @@ def observatory(series: xr.Dataset, date: np.datetime64) -> xr.Dataset:
         np.array([float(series.attrs[name])]) for name in ("latitude", "longitude", "elevation")
     )
     dip = dip_latitude(latitude, longitude, elevation, date)
-    degrees = {"units": "degrees_north"}
     return xr.Dataset(
         {
             "iaga_code": ("observatory", np.array([series.attrs["iaga_code"]])),
-            "latitude": ("observatory", latitude, degrees),
+            "latitude": ("observatory", latitude, {"units": "degrees_north"}),
             "longitude": ("observatory", longitude, {"units": "degrees_east"}),
             "elevation": ("observatory", elevation, {"units": "m"}),
-            "dip_latitude": ("observatory", dip, degrees),
+            "dip_latitude": ("observatory", dip, {"units": "degree"}),
             "element": ("element", np.array(ELEMENTS)),
         },
         attrs={"source": str(series.attrs["source"]), "cadence_s": series.attrs["cadence_s"]},

@@ -28,6 +28,8 @@ def test_what_is_written_is_read_back(tile: xr.Dataset, tmp_path: Path) -> None:
         for name, variable in tile.variables.items():
             np.testing.assert_array_equal(back[name].values, variable.values)
             assert back[name].dtype.name == TILE_VARIABLES[str(name)].dtype
+        assert back.attrs.pop("title") == "magnetic anomaly tile, row 1, column 2"
+        assert "provenance.json" in back.attrs.pop("history")
         assert back.attrs == tile.attrs
 
 

@@ -66,7 +66,7 @@ def temporal_dataset(
             "latitude": ("observatory", [s[1] for s in stations], {"units": "degrees_north"}),
             "longitude": ("observatory", [s[2] for s in stations], {"units": "degrees_east"}),
             "elevation": ("observatory", np.zeros(n), {"units": "m"}),
-            "dip_latitude": ("observatory", [s[3] for s in stations], {"units": "degrees_north"}),
+            "dip_latitude": ("observatory", [s[3] for s in stations], {"units": "degree"}),
             "element": ("element", np.array(ELEMENTS)),
             "month": ("month", time),
             "minute": ("minute", MINUTE, {"units": "min"}),
