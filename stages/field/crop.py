@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from magtiles.schemas.errors import CoverageError, ParameterError
 from magtiles.stages.declare import Params, Stage, quantity
-from magtiles.stages.field.geometry import axes, true_spacing
+from magtiles.stages.field.geometry import axes, is_geographic, is_whole_circle, true_spacing
 from magtiles.stages.field.plane import Plane, choose_plane, grid_index
 
 Real = NDArray[np.float64]
@@ -39,6 +39,7 @@ def crop_grid(grid: xr.Dataset, *, params: CropGridParams) -> xr.Dataset:
             where="region",
             expected="south < north, both within -90 to 90",
         )
+    grid = _cut_opposite(grid, west + ((east - west) % 360.0 or 360.0) / 2)
     plane = choose_plane(grid)
     row, column = grid_index(grid, plane, *_region_points(params, filled=False))
     span = []
@@ -59,6 +60,21 @@ def crop_grid(grid: xr.Dataset, *, params: CropGridParams) -> xr.Dataset:
         )
     first_dim, second_dim = grid["magnetic_anomaly"].dims
     return grid.isel({first_dim: span[0], second_dim: span[1]})
+
+
+def _cut_opposite(grid: xr.Dataset, longitude: float) -> xr.Dataset:
+    """A grid all around the globe, cut open opposite a longitude; any other as it is."""
+    if not is_geographic(grid) or not is_whole_circle(grid["longitude"].values):
+        return grid
+    own = grid["longitude"]
+    step = float(own[1] - own[0])
+    first = int(np.rint((longitude - 180.0 - float(own[0])) / step))
+    start = float(own[0]) + step * first
+    start = (start + 180.0) % 360.0 - 180.0
+    turned = grid.roll(longitude=-first)
+    return turned.assign_coords(
+        longitude=("longitude", start + step * np.arange(own.size), own.attrs)
+    )
 
 
 def _region_points(params: CropGridParams, filled: bool) -> tuple[Real, Real]:
@@ -96,7 +112,7 @@ def _extent(grid: xr.Dataset, plane: Plane) -> str:
 
 STAGE = Stage(
     name="crop-grid",
-    version=1,
+    version=2,
     params=CropGridParams,
     inputs={"grid": "anomaly-grid/1"},
     output="anomaly-grid/1",

@@ -24,6 +24,12 @@ def is_geographic(grid: xr.Dataset) -> bool:
     return grid["magnetic_anomaly"].dims[0] == "latitude"
 
 
+def is_whole_circle(longitude: Real) -> bool:
+    """Whether ascending longitudes (degrees) go all around the globe, each meridian once."""
+    step = float(longitude[1] - longitude[0])
+    return bool(abs(longitude[-1] - longitude[0] + step - 360.0) < 0.5 * step)
+
+
 def steps(grid: xr.Dataset) -> tuple[float, float]:
     """Mean node spacing along rows and columns, in the axes' own units."""
     return tuple((a[-1] - a[0]) / max(a.size - 1, 1) for a in axes(grid))

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from magtiles.stages.crs import dataset_to_wgs84
+from magtiles.stages.field.geometry import is_whole_circle
 from magtiles.stages.field.interpolate import evaluate_linear
 from magtiles.stages.field.plane import STEP_DEG, on_lattice
 
@@ -58,7 +59,7 @@ def sample(values: xr.DataArray, dataset: xr.Dataset, latitude: Real, longitude:
     heights = values.values.astype(np.float64)
     row, column = node_index(values, dataset, latitude, longitude)
     width = _lattice_cell(row, column)
-    if values.dims[0] == "latitude" and _is_whole_circle(dataset["longitude"].values):
+    if values.dims[0] == "latitude" and is_whole_circle(dataset["longitude"].values):
         # Columns go on around the globe.
         beside = int(np.ceil(max(width[1], 1.0))) + 1
         heights = np.pad(heights, ((0, 0), (beside, beside)), mode="wrap")
@@ -95,11 +96,6 @@ def nearest_known(sampled: Sampled) -> Real:
 def _half_turn(angle: Real) -> Real:
     """An angle in degrees, within half a turn of zero."""
     return (angle + 180.0) % 360.0 - 180.0
-
-
-def _is_whole_circle(longitude: Real) -> bool:
-    step = float(longitude[1] - longitude[0])
-    return abs(longitude[-1] - longitude[0] + step - 360.0) < 0.5 * step
 
 
 def _lattice_cell(row: Real, column: Real) -> tuple[float, float]:

@@ -42,6 +42,8 @@ _READERS: dict[str, Callable[[Path, GridFileParams], RawGrid]] = {
     **{kind: functools.partial(read_raster, kind) for kind in RASTERS},
 }
 
+_OTHERS_VOIDS = (9999.0, 88888.0, 99999.0)
+
 _AXIS_ATTRS = {
     "x": {"units": "m", "standard_name": "projection_x_coordinate", "axis": "X"},
     "y": {"units": "m", "standard_name": "projection_y_coordinate", "axis": "Y"},
@@ -206,6 +208,7 @@ def regular(grid: GridFile[G]) -> RegularGrid:
     CRS or a unit that is not known.
     """
     raw, file = grid.raw, grid.path.name
+    _check_marks(grid)
     if raw.values.shape != (raw.y.size, raw.x.size):
         raise FormatError(
             f"the values are {raw.values.shape}",
@@ -276,6 +279,22 @@ def _check_latitudes(y: NDArray[np.float64], file: str) -> None:
             where=f"{file} axis y",
             expected="-90 to 90",
             remedy="check the CRS and the order of the axes",
+        )
+
+
+def _check_marks(grid: GridFile[G]) -> None:
+    """Refuse what others mark voids with, where nobody says whether it does here."""
+    if grid.params.no_data is not None:
+        return
+    marks = np.isin(np.abs(grid.raw.values), _OTHERS_VOIDS)
+    if marks.any():
+        mark = grid.raw.values[marks][0]
+        raise FormatError(
+            f"{np.count_nonzero(marks)} values are {mark:g}, as in other files where there is "
+            "no value",
+            where=grid.path.name,
+            expected="voids marked by the file, or by the key 'no_data'",
+            remedy=f"set no_data = {mark:g}.0, or, if they are values, to a number that none is",
         )
 
 

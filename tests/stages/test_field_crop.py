@@ -83,3 +83,18 @@ def test_across_the_date_line(longitude):
     assert 179.5 - 0.15 < nodes[0] <= 179.5
     assert 181.0 <= nodes[-1] < 181.0 + 0.15
     assert 52.0 <= cropped["latitude"].values[-1] < 52.15
+
+
+@pytest.mark.parametrize("first", [-180.0, 0.0, -170.0])
+def test_a_globe_is_whole_across_its_own_cut(first):
+    longitude = first + np.arange(360.0)
+    values = np.cos(np.radians(longitude)) + np.arange(-90.0, 91.0)[:, None]
+    globe = geographic_grid(values, np.arange(-90.0, 91.0), longitude)
+    cropped = crop(globe, (-10.0, 10.0), (170.0, -170.0), margin_m=111e3)
+    nodes = cropped["longitude"].values
+    np.testing.assert_array_equal(np.diff(nodes), 1.0)
+    assert 166.0 <= nodes[0] <= 169.0
+    assert 191.0 <= nodes[-1] <= 194.0
+    exact = np.cos(np.radians(nodes)) + cropped["latitude"].values[:, None]
+    np.testing.assert_allclose(cropped["magnetic_anomaly"], exact, rtol=0, atol=1e-12)
+    contracts.check(cropped, "anomaly-grid/1")

@@ -319,7 +319,13 @@ def test_a_column_of_uncertainty(tmp_path: Path) -> None:
 
 class TestReal:
     def _grid(self, path: Path) -> xr.Dataset:
-        return ingest_grid([path], params=IngestGridParams(crs="EPSG:4326", **_SAID))
+        said = {"crs": "EPSG:4326", "no_data": -99999.0, **_SAID}
+        return ingest_grid([path], params=IngestGridParams(**said))
+
+    def test_emag2_voids_must_be_stated(self, real_data: Path) -> None:
+        params = IngestGridParams(crs="EPSG:4326", **_SAID)
+        with pytest.raises(FormatError, match=r"6167 values are -99999.*no_data = -99999\.0"):
+            ingest_grid([real_data / "grids" / "EMAG2_V2_1x1.grd"], params=params)
 
     def test_emag2_of_the_world(self, real_data: Path) -> None:
         """Old GMT layout: 361 x 181, the meridian at both ends dropped once."""
