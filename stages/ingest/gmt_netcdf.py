@@ -38,8 +38,9 @@ def read_old_gmt(dataset: xr.Dataset, path: Path, params: GridFileParams) -> Raw
             expected=f"dimension {columns} x {rows} = {columns * rows}",
             remedy="fetch it again",
         )
-    mark = stored.attrs.get("_FillValue", params.no_data)
-    values = mark_voids(stored.values, None if mark is None else float(mark))
+    # GMT's own mark is NaN; grids resampled from others may still hold theirs.
+    mark = float(stored.attrs.get("_FillValue", np.nan))
+    values = mark_voids(stored.values, params.no_data if np.isnan(mark) else mark)
     values = values * float(stored.attrs.get("scale_factor", 1.0))
     values = values + float(stored.attrs.get("add_offset", 0.0))
     cells = int(stored.attrs.get("node_offset", 0)) == 1

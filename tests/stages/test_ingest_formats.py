@@ -332,6 +332,7 @@ class TestReal:
         grid = self._grid(real_data / "grids" / "EMAG2_V2_1x1.grd")
         assert dict(grid.sizes) == {"latitude": 181, "longitude": 360}
         assert float(grid.longitude[0]) == -180.0
+        assert int(grid.magnetic_anomaly.isnull().sum()) == 6161  # 6167, six of them twice
 
     def test_two_editions_of_emag2_agree(self, real_data: Path) -> None:
         """The world's nodes are the patch's own, to the digits that the text was printed with."""
