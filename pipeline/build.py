@@ -8,15 +8,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from magtiles.catalog.releases.temporal_table import PATH as TEMPORAL_PATH
 from magtiles.pipeline import receipts
 from magtiles.pipeline.cutting import cutting
 from magtiles.pipeline.model_map import plan_model_map
 from magtiles.pipeline.product import ModelMap, Product, SurveyMap, load_product
 from magtiles.pipeline.progress import Progress, silent
-from magtiles.pipeline.steps import MapPlan, Steps
+from magtiles.pipeline.roads_part import build_roads
+from magtiles.pipeline.steps import MapPlan, PartResult, Steps
 from magtiles.pipeline.survey_map import plan_survey_map
-from magtiles.pipeline.temporal_part import TemporalResult, build_temporal
+from magtiles.pipeline.temporal_part import build_temporal
 from magtiles.schemas.errors import CoverageError, MagtilesError, ParameterError, SourceError
 from magtiles.stages.release.provenance import resource, slsa_predicate
 from magtiles.stages.release.publish import PublishResult, publish_release
@@ -81,12 +81,15 @@ def _build(
     more = 0 if wanted.temporal is None else wanted.temporal.steps
     if isinstance(wanted.map, SurveyMap) and wanted.map.surface is not None:
         more += wanted.map.surface.steps
+    more += sum(roads.steps for roads in wanted.roads)
     steps = Steps(progress, total=4 + len(wanted.map.table.heights_m) + more)
     plan = _plan(wanted, folder, data, steps)
-    temporal = None
+    parts = []
     if wanted.temporal is not None:
         _require_core_field(plan)
-        temporal = build_temporal(wanted.temporal, folder, data, steps)
+        parts.append(build_temporal(wanted.temporal, folder, data, steps))
+    if wanted.roads:
+        parts.append(build_roads(wanted.roads, folder, data, steps))
     with cutting(plan.lattice, len(plan.heights)) as cutter:
         levels, pictures = [], []
         for height in plan.heights:
@@ -96,7 +99,7 @@ def _build(
         cut = cutter.cut(levels, plan.surface, folder / "tiles", progress)
         cutter.finish_drawing()
     steps.report("publishing")
-    return _publish(wanted, store, plan, cut, levels, pictures, temporal)
+    return _publish(wanted, store, plan, cut, levels, pictures, parts)
 
 
 def _plan(wanted: Product, folder: Path, data: Path | None, steps: Steps) -> MapPlan:
@@ -123,17 +126,16 @@ def _publish(
     cut: Sequence[MeasuredTile],
     levels: Sequence[Path],
     pictures: Sequence[Path],
-    temporal: TemporalResult | None,
+    parts: Sequence[PartResult],
 ) -> PublishResult:
     extra = {f"preview/{picture.name}": picture for picture in pictures}
     if plan.core_field is not None:
         extra["core_field.shc"] = plan.core_field
     inputs, artifacts = list(plan.inputs), [*plan.artifacts, *levels]
-    if temporal is not None:
-        extra |= {f"preview/{name}": picture for name, picture in temporal.pictures.items()}
-        extra[TEMPORAL_PATH] = temporal.path
-        inputs += temporal.inputs
-        artifacts += temporal.artifacts
+    for part in parts:
+        extra |= part.files
+        inputs += part.inputs
+        artifacts += part.artifacts
     return publish_release(
         store,
         product=wanted.product.name,
@@ -156,6 +158,7 @@ def _provenance(
     sources = [plan.source]
     if wanted.temporal is not None:
         sources += [s.path for s in (*wanted.temporal.observatories, *wanted.temporal.indices)]
+    sources += list(dict.fromkeys(s.path for roads in wanted.roads for s in roads.sources))
     return slsa_predicate(
         parameters={
             "product": _described(wanted.path),

@@ -10,6 +10,7 @@ import pydantic
 
 from magtiles.catalog.models.igrf import igrf_files
 from magtiles.pipeline.reference_surface import ReferenceSurface, load_reference_surface
+from magtiles.pipeline.road_sources import RoadSources, RoadsTable, load_roads
 from magtiles.pipeline.source_paths import find_source
 from magtiles.pipeline.temporal_part import TemporalSources, TemporalTable, load_temporal
 from magtiles.schemas.errors import SourceError
@@ -161,6 +162,7 @@ class ProductTables(Params):
     anomaly: AnomalyTable | None = quantity("1", default=None, doc="The map of a survey.")
     model: ModelTable | None = quantity("1", default=None, doc="The map of a field model.")
     temporal: TemporalTable | None = quantity("1", default=None, doc="Variations in time.")
+    roads: tuple[RoadsTable, ...] = quantity("1", default=(), doc="Maps of roads.")
 
 
 @dataclass(frozen=True)
@@ -206,6 +208,7 @@ class Product:
     product: ProductTable
     map: SurveyMap | ModelMap
     temporal: TemporalSources | None = None
+    roads: tuple[RoadSources, ...] = ()
 
 
 def load_product(path: Path) -> Product:
@@ -213,12 +216,11 @@ def load_product(path: Path) -> Product:
 
     Raises SourceError naming file and key.
     """
-    tables: ProductTables = parse_params(
-        ProductTables, load_toml(path), where=path, error=SourceError
-    )
+    document = load_toml(path, lists=("roads",))
+    tables: ProductTables = parse_params(ProductTables, document, where=path, error=SourceError)
     made_from = _map(tables.anomaly, tables.model, path)
     temporal = None if tables.temporal is None else load_temporal(tables.temporal, path)
-    return Product(path, tables.product, made_from, temporal)
+    return Product(path, tables.product, made_from, temporal, load_roads(tables.roads, path))
 
 
 def _map(survey: AnomalyTable | None, model: ModelTable | None, path: Path) -> SurveyMap | ModelMap:

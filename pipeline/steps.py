@@ -25,6 +25,10 @@ class Steps:
         self._progress(what, self._done, self._total)
         self._done += 1
 
+    def expect(self, more: int) -> None:
+        """Count on more steps than were known of at first."""
+        self._total += more
+
     def run(
         self, stage: Stage, inputs: Mapping[str, Any], out: Path, params: Mapping[str, Any]
     ) -> Path:
@@ -73,3 +77,19 @@ def node_axes(lattice: Lattice) -> dict[str, tuple[float, float, int]]:
             lattice.columns + 1 + 2 * HALO,
         ),
     }
+
+
+@dataclass(frozen=True)
+class PartResult:
+    """A part of a release beside its map.
+
+    Attributes
+    ----------
+    files : by their place in the release; pictures too.
+    artifacts : what was made on the way, in order.
+    inputs : of the manifest: id, sha256, licence and role of each.
+    """
+
+    files: Mapping[str, Path]
+    artifacts: Sequence[Path]
+    inputs: Sequence[Mapping[str, str]]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,10 +12,11 @@ import numpy as np
 import pydantic
 import xarray as xr
 
+from magtiles.catalog.releases.temporal_table import PATH as TEMPORAL_PATH
 from magtiles.catalog.releases.temporal_table import TEMPORAL_VARIABLES
 from magtiles.pipeline.artifacts import open_artifact
 from magtiles.pipeline.source_paths import data_files, find_source, manifest_inputs
-from magtiles.pipeline.steps import Steps
+from magtiles.pipeline.steps import PartResult, Steps
 from magtiles.pipeline.temporal_plots import StationData, draw_station
 from magtiles.schemas.errors import CoverageError, SourceError
 from magtiles.stages.declare import Params, quantity
@@ -66,16 +67,6 @@ class TemporalSources:
         return _STAGES_PER_STATION * len(self.observatories) + bool(self.indices) + 2
 
 
-@dataclass(frozen=True)
-class TemporalResult:
-    """temporal.nc, pictures by name, what was made on the way, and inputs of the manifest."""
-
-    path: Path
-    pictures: Mapping[str, Path]
-    artifacts: Sequence[Path]
-    inputs: Sequence[Mapping[str, str]]
-
-
 def load_temporal(table: TemporalTable, product: Path) -> TemporalSources:
     """Find and read the sources of a [temporal] table. SourceError naming file and key."""
     return TemporalSources(
@@ -101,7 +92,7 @@ def _load(
 
 def build_temporal(
     wanted: TemporalSources, folder: Path, data: Path | None, steps: Steps
-) -> TemporalResult:
+) -> PartResult:
     """Run every stage from records and indices to temporal.nc and its pictures in `folder`.
 
     `data` is a folder of local copies of the sources' files, as of `build_product`. Pooled
@@ -124,14 +115,13 @@ def build_temporal(
     with open_artifact(whole) as opened:
         write_temporal(_of_months(opened, wanted.table.months).load(), path)
     pictures = {
-        name: picture
+        f"preview/{name}": picture
         for station in made
         for name, picture in draw_station(station, folder / "preview").items()
     }
     records = [p for s in made for p in (s.record, s.series, s.baseline, s.fits)]
-    return TemporalResult(
-        path, pictures, [*([activity] if activity else []), *records, whole], inputs
-    )
+    artifacts = [*([activity] if activity else []), *records, whole]
+    return PartResult({TEMPORAL_PATH: path, **pictures}, artifacts, inputs)
 
 
 def _index(wanted: TemporalSources, folder: Path, data: Path | None, steps: Steps) -> Path | None:

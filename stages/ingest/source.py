@@ -129,6 +129,9 @@ class SourceParams(Params):
     licence: str = quantity("1", min_length=1, doc="Under which terms the data may be used.")
     title: str | None = quantity("1", default=None, doc="One line for people.")
     url: str | None = quantity("1", default=None, doc="Where it is published.")
+    urls: tuple[str, ...] = quantity(
+        "1", default=(), doc="Where its files, or zip or tar archives of them, are fetched from."
+    )
     citation: str | None = quantity("1", default=None, doc="How to cite it.")
     sha256: dict[str, str] = quantity("1", default={}, doc="Digest of each file, by its name.")
 
@@ -213,8 +216,11 @@ def _header(path: Path, tables: dict[str, dict[str, Any]]) -> SourceParams:
     return header
 
 
-def load_toml(path: Path) -> dict[str, dict[str, Any]]:
-    """The tables of a TOML file. Raises SourceError naming file and line."""
+def load_toml(path: Path, *, lists: Sequence[str] = ()) -> dict[str, Any]:
+    """The tables of a TOML file; those of a name in `lists` may be several, [[name]].
+
+    Raises SourceError naming file and line.
+    """
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as caught:
@@ -224,7 +230,8 @@ def load_toml(path: Path) -> dict[str, dict[str, Any]]:
     except tomllib.TOMLDecodeError as caught:
         raise SourceError(f"is not TOML: {caught}", where=path) from None
     for name, table in document.items():
-        if not isinstance(table, dict):
+        several = table if name in lists and isinstance(table, list) else [table]
+        if not all(isinstance(one, dict) for one in several):
             raise SourceError(
                 f"key '{name}' stands outside any table",
                 where=path,
