@@ -24,7 +24,7 @@ export MPLCONFIGDIR := $(CURDIR)/build/matplotlib
 
 .DEFAULT_GOAL := tiles
 .DELETE_ON_ERROR:
-.PHONY: tiles $(RELEASES) test check validate report bench wheel-check lock clean help
+.PHONY: tiles $(RELEASES) test check validate report data bench wheel-check lock clean help
 
 tiles: $(RELEASES) ## Build and validate PRODUCT="a.toml b.toml" (default: the demo), `-j` for side by side
 	@printf '%s\n' '' 'Releases are in $(STORE). Next, with RELEASE one of them:' \
@@ -66,6 +66,11 @@ report: $(READY) ## Write one offline HTML page about every release under STORE,
 	  mkdir -p build/reports; $(MAGTILES) report "$$folder" --out "$$page" || exit; \
 	done; \
 	[ -n "$$found" ] || { echo 'no release under $(STORE): run make tiles' >&2; exit 1; }
+
+data: $(READY) ## Fetch the public sources that a program can fetch, to MAGTILES_CACHE or the user's cache
+	@$(MAGTILES) sources --json | $(BIN)/python -c 'import json, sys; \
+	  print(*(s["id"] for s in json.load(sys.stdin) if s["by_program"]))' | \
+	  xargs -n 1 $(MAGTILES) fetch
 
 bench: $(READY) ## Run the benchmarks, each against its reference in one process
 	@for script in tests/benchmarks/*.py; do \

@@ -21,6 +21,7 @@ from magtiles.pipeline.commands import (
     build,
     diff,
     export,
+    fetch,
     info,
     keygen,
     plot,
@@ -29,6 +30,7 @@ from magtiles.pipeline.commands import (
     run,
     sample,
     sign,
+    sources,
     stages,
     validate,
 )
@@ -46,6 +48,8 @@ COMMANDS: tuple[ModuleType, ...] = (
     sign,
     export,
     sample,
+    sources,
+    fetch,
     stages,
     run,
 )
@@ -64,6 +68,7 @@ _EXTRA = (
     "matplotlib",
     "mcap",
     "pandas",
+    "pooch",
     "ppigrf",
     "pydantic",
     "pyproj",

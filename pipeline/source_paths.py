@@ -8,8 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from magtiles.pipeline import receipts
+from magtiles.pipeline.fetching import cache_folder
 from magtiles.schemas.errors import SourceError
 from magtiles.stages.ingest.source import Source
+
+_CATALOG = Path(str(resources.files("magtiles.catalog"))) / "sources"
 
 
 def find_source(name: str, product: Path, key: str) -> Path:
@@ -27,7 +30,7 @@ def find_source(name: str, product: Path, key: str) -> Path:
             expected=f"a file at {found}",
             remedy="correct the path",
         )
-    entry = Path(str(resources.files("magtiles.catalog"))) / "sources" / f"{name}.toml"
+    entry = _CATALOG / f"{name}.toml"
     if entry.is_file():
         return entry
     raise SourceError(
@@ -39,7 +42,12 @@ def find_source(name: str, product: Path, key: str) -> Path:
 
 
 def data_files(source: Source[Any], data: Path | None) -> list[Path]:
-    """A source's data files: in `data` where it is given, else beside the source TOML."""
+    """A source's data files: in `data` where it is given, else where they belong.
+
+    That is beside the source TOML, or for a source of the catalog where `magtiles fetch` puts them.
+    """
+    if data is None and source.path.parent == _CATALOG:
+        data = cache_folder() / source.source.id
     return list(source.files) if data is None else [data / file.name for file in source.files]
 
 
