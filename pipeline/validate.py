@@ -35,7 +35,9 @@ from magtiles.pipeline.road_checks import check_roads
 from magtiles.pipeline.temporal_checks import Finding, check_temporal
 from magtiles.schemas import contracts
 from magtiles.schemas.errors import MagtilesError
+from magtiles.stages.ingest.hdf5_checks import check_hdf5
 from magtiles.stages.release.checks import CHECKS_NAME, TOLERANCE, replay_checks
+from magtiles.stages.release.records import IDENTITY_ATTRIBUTES, MeasuredTile, measure_tile
 
 GRADIENT_TOLERANCE = 0.01
 """Of the rms gradient, beyond what the difference scheme itself loses."""
@@ -81,6 +83,9 @@ def validate_release(
         )
     checks.append(_attempt("files", lambda: _check_files(folder, manifest)))
     checks.append(_check_digests(folder, manifest))
+    checks.append(_check_contained(folder, manifest))
+    if not checks[-1].passed:  # such a file can crash its reader
+        return checks
     checks.append(_check_units(manifest))
     checks += _check_tiles(folder, manifest)
     if manifest.temporal is not None:
@@ -125,6 +130,17 @@ def _check_digests(folder: Path, manifest: Manifest) -> Check:
         except MagtilesError as problem:
             problems.append(str(problem))
     return _counted("digests", problems, "files", f"{len(manifest.files)} files")
+
+
+def _check_contained(folder: Path, manifest: Manifest) -> Check:
+    problems = []
+    paths = [folder / file.path for file in manifest.files if file.path.endswith(".nc")]
+    for path in paths:
+        try:
+            check_hdf5(path, kind="netCDF-4")
+        except MagtilesError as problem:
+            problems.append(str(problem))
+    return _counted("self-contained", problems, "files", f"{len(paths)} netCDF files")
 
 
 def _check_units(manifest: Manifest) -> Check:
@@ -176,6 +192,7 @@ class _Findings:
         levels = manifest.heights_m
         self._contracts: list[str] = []
         self._arrays: list[str] = []
+        self._described: list[str] = []
         self._owners: list[tuple[range, range]] = []
         self._overlaps = Overlaps()
         self._least_sigma = np.inf
@@ -192,6 +209,8 @@ class _Findings:
         try:
             with open_artifact(self._folder / record.path) as dataset:
                 contracts.check(dataset, "anomaly-tile/1", where=record.path)
+                measured = measure_tile(self._folder / record.path, dataset)
+                self._described += list(_misdescribed(record, measured, self._manifest))
         except MagtilesError as problem:
             self._contracts.append(str(problem))
         found = array_digest(tile.variables)
@@ -247,6 +266,7 @@ class _Findings:
         tiles = f"{len(self._manifest.tiles)} tiles"
         yield _counted("tile contracts", self._contracts, "tiles", tiles)
         yield _counted("array digests", self._arrays, "tiles", tiles)
+        yield _counted("descriptions", self._described, "entries", f"of {tiles}, as measured anew")
         yield self._coverage()
         overlaps = self._overlaps
         compared = f"{overlaps.compared} values compared to the bit"
@@ -271,6 +291,25 @@ class _Findings:
         wrong = uncovered_cells(self._owners, lattice.rows, lattice.columns)
         where = f"not owned by exactly one tile, of {lattice.rows} x {lattice.columns}"
         return _count("coverage", wrong, "cells", where)
+
+
+def _misdescribed(record: TileRecord, measured: MeasuredTile, manifest: Manifest) -> Iterator[str]:
+    """What the manifest says of a tile, or of all tiles, and this one does not."""
+    for name in IDENTITY_ATTRIBUTES:
+        found = measured.attributes.get(name)
+        if found != manifest.identity[name]:
+            yield f"{record.path}: {name} is {found!r}; expected {manifest.identity[name]!r}"
+    numbers: list[tuple[str, Any, Any]] = [
+        (name, share, measured.entry["flag_fractions"].get(name, np.nan))
+        for name, share in record.flag_fractions.items()
+    ]
+    for name, stated in record.statistics.items():
+        found = measured.entry["statistics"].get(name, {})
+        numbers += [(f"{k} of {name}", v, found.get(k, np.nan)) for k, v in stated.items()]
+    for name, told, found in numbers:
+        # Stated to six digits.
+        if np.shape(told) != np.shape(found) or not np.allclose(found, told, 1e-5, 1e-9):
+            yield f"{record.path}: {name} is {found}; expected {told}"
 
 
 def uncovered_cells(owners: list[tuple[range, range]], rows: int, columns: int) -> int:

@@ -37,9 +37,11 @@ def test_exact_release_passes_every_check(exact_release: Path, capsys: Capture) 
         "manifest",
         "files",
         "digests",
+        "self-contained",
         "units",
         "tile contracts",
         "array digests",
+        "descriptions",
         "coverage",
         "overlaps",
         "uncertainty",
@@ -55,7 +57,7 @@ def test_exact_release_passes_every_check(exact_release: Path, capsys: Capture) 
     assert measured["gradients at 500 m"] < 8e-5
     assert measured["gradients at 1500 m"] < 2e-5
     assert main(["validate", str(exact_release)]) == 0
-    assert "15 checks passed" in capsys.readouterr().out
+    assert "17 checks passed" in capsys.readouterr().out
 
 
 def flip_bit(folder: Path) -> None:
