@@ -25,8 +25,8 @@ from magtiles.stages.release.plan import Bounds, plan_lattice
 
 _MARGIN_HEIGHTS = 20.0
 _MARGIN_CELLS = 64
-_MARGIN_M = 2e6
-"""Most of either: 20 times the highest level there is, and farther off the Earth is no plane."""
+_MARGIN_CELLS_M = 500e3
+"""No cells are kept for their number alone farther off: there the plane's scale is another."""
 _LEAST_GAP_M = 1.0
 
 
@@ -80,7 +80,7 @@ def _survey(wanted: AnomalyTable, files: Sequence[Path], folder: Path, steps: St
     region = wanted.region
     if region is not None:
         gain = max(abs(h - height) for h in wanted.heights_m)
-        margin = min(max(_MARGIN_HEIGHTS * gain, _MARGIN_CELLS * cell), _MARGIN_M)
+        margin = max(_MARGIN_HEIGHTS * gain, min(_MARGIN_CELLS * cell, _MARGIN_CELLS_M))
         limits = {"latitude": region.latitude, "longitude": region.longitude, "margin_m": margin}
         grid = steps.run(crop.STAGE, {"grid": grid}, folder / "cropped.nc", limits)
         bounds = region.bounds
