@@ -34,6 +34,9 @@ BIN_M = 10.0
 LEAST_PEAK = 0.2
 """Of the ABL: the least normalised likelihood of the highest point."""
 
+CHOICE_BLOCK = 256
+"""Points that are passed over together where none is likely."""
+
 _LOG_2PI = float(np.log(2.0 * np.pi))
 
 
@@ -139,11 +142,16 @@ def choose(
     """
     from magtiles.catalog.kernels import road_match_compiled as kernels
 
-    best, second, centre, total = kernels.choose(
-        log_likelihood, position, run, minimum_distance_m**2, bin_points
+    best = int(log_likelihood.argmax())
+    whole = log_likelihood.size // CHOICE_BLOCK * CHOICE_BLOCK
+    greatest = log_likelihood[:whole].reshape(-1, CHOICE_BLOCK).max(axis=1)
+    greatest = np.append(greatest, log_likelihood[whole:].max(initial=-np.inf))
+    second, centre, total = kernels.choose(
+        log_likelihood, greatest, best, position, run, minimum_distance_m**2, bin_points
     )
     gap = log_likelihood[best] - second
-    return Choice(int(best), float(np.exp(min(gap, 700.0))), int(centre), 1.0 / float(total))
+    ratio = float(np.exp(gap)) if gap < 700.0 else np.inf
+    return Choice(best, ratio, int(centre), 1.0 / float(total))
 
 
 def root_mean_square(difference: Floats, form: Form) -> float:

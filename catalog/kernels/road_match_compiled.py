@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtiles.catalog.kernels.jit import compiled as _compile
+from magtiles.catalog.kernels.road_match import CHOICE_BLOCK
 
 Floats = NDArray[np.float64]
 
@@ -28,20 +29,24 @@ def measured(
     out: Floats,
 ) -> None:
     """Fill `out` with log-likelihoods of `section` (3, K) from point `start` of the map on."""
+    # A loop that counts from 0 over slices, and no other index, becomes vector instructions.
     axes, length = section.shape
     for low in range(0, out.size, _BLOCK):
-        high = min(low + _BLOCK, out.size)
-        for s in range(low, high):
-            out[s] = constant + log_variance[start + s + length] - log_variance[start + s]
+        part = out[low : low + _BLOCK]
+        at, count = start + low, part.size
+        first, last = log_variance[at : at + count], log_variance[at + length :]
+        for s in range(count):
+            part[s] = constant + last[s] - first[s]
         for a in range(axes):
             for i in range(length):
                 z = section[a, i]
-                at = start + i
-                for s in range(low, high):
-                    d = z - field[a, at + s]
-                    out[s] += d * d * weight[a, at + s]
-        for s in range(low, high):
-            out[s] *= -0.5
+                f = field[a, at + i : at + i + count]
+                w = weight[a, at + i : at + i + count]
+                for s in range(count):
+                    d = z - f[s]
+                    part[s] += d * d * w[s]
+        for s in range(count):
+            part[s] *= -0.5
 
 
 @_compile
@@ -58,80 +63,86 @@ def demeaned(
     axes, length = section.shape
     ones, firsts, squares = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
     for low in range(0, out.size, _BLOCK):
-        count = min(_BLOCK, out.size - low)
-        at = start + low
+        part = out[low : low + _BLOCK]
+        at, count = start + low, part.size
+        first, last = log_variance[at : at + count], log_variance[at + length :]
         for s in range(count):
-            out[low + s] = constant + log_variance[at + s + length] - log_variance[at + s]
+            part[s] = constant + last[s] - first[s]
         for a in range(axes):
             ones[:] = 0.0
             firsts[:] = 0.0
             squares[:] = 0.0
             for i in range(length):
                 z = section[a, i]
+                f = field[a, at + i : at + i + count]
+                w = weight[a, at + i : at + i + count]
                 for s in range(count):
-                    w = weight[a, at + i + s]
-                    d = z - field[a, at + i + s]
-                    ones[s] += w
-                    firsts[s] += w * d
-                    squares[s] += w * d * d
+                    d = z - f[s]
+                    ones[s] += w[s]
+                    firsts[s] += w[s] * d
+                    squares[s] += w[s] * d * d
             for s in range(count):
-                out[low + s] += squares[s] - firsts[s] * firsts[s] / ones[s] + math.log(ones[s])
-        for s in range(low, low + count):
-            out[s] *= -0.5
+                part[s] += squares[s] - firsts[s] * firsts[s] / ones[s] + math.log(ones[s])
+        for s in range(count):
+            part[s] *= -0.5
 
 
 @_compile
 def choose(
     log_likelihood: Floats,
+    greatest: Floats,
+    best: int,
     position: Floats,
     run: NDArray[np.int64],
     least_squared: float,
     bin_points: int,
-) -> tuple[int, float, int, float]:
-    """Best point, highest log-likelihood far from it, centre of the best bin, sum over the best.
+) -> tuple[float, int, float]:
+    """Highest log-likelihood far from the best, centre of the best bin, sum over the best.
 
-    The sum of likelihoods is in units of the best one's.
+    `greatest` holds the maximum of each `CHOICE_BLOCK` points: most need no look. The sum of
+    likelihoods is in units of the best one's.
     """
     n = log_likelihood.size
-    best = 0
-    for s in range(n):
-        if log_likelihood[s] > log_likelihood[best]:
-            best = s
     top, north, east = log_likelihood[best], position[best, 0], position[best, 1]
-    second, total = -math.inf, 0.0
-    share = np.zeros(n)
-    for s in range(n):
-        value = log_likelihood[s]
-        if value > top - _NEGLIGIBLE:
-            share[s] = math.exp(value - top)
-            total += share[s]
-        if value > second:
-            y, x = position[s, 0] - north, position[s, 1] - east
-            if y * y + x * x >= least_squared:
-                second = value
-    return best, second, _best_bin(share, run, bin_points), total
+    second, total, count = -math.inf, 0.0, 0
+    place, share = np.empty(n, np.int64), np.empty(n)
+    for b in range(greatest.size):
+        if greatest[b] <= min(second, top - _NEGLIGIBLE):
+            continue
+        for s in range(b * CHOICE_BLOCK, min((b + 1) * CHOICE_BLOCK, n)):
+            value = log_likelihood[s]
+            if value > top - _NEGLIGIBLE:
+                place[count], share[count] = s, math.exp(value - top)
+                total += share[count]
+                count += 1
+            if value > second:
+                y, x = position[s, 0] - north, position[s, 1] - east
+                if y * y + x * x >= least_squared:
+                    second = value
+    return second, _best_bin(place[:count], share[:count], run, bin_points), total
 
 
 @_compile
-def _best_bin(share: Floats, run: NDArray[np.int64], bin_points: int) -> int:
-    """The likelihood's centre in the bin of most likelihood, rounded to a point."""
-    most, last, held, begin = -1.0, 0, 0.0, 0
-    for s in range(share.size):
-        if run[s] != run[begin]:
-            held, begin = 0.0, s
-        held += share[s]
-        if s - begin == bin_points:
+def _best_bin(
+    place: NDArray[np.int64], share: Floats, run: NDArray[np.int64], bin_points: int
+) -> int:
+    """The likelihood's centre, rounded to a point, in the bin of most likelihood.
+
+    `place` are the points that have any, ascending, and `share` how much.
+    """
+    most, held, begin, first, last = -1.0, 0.0, 0, 0, 0
+    for k in range(place.size):
+        held += share[k]
+        while run[place[begin]] != run[place[k]] or place[k] - place[begin] >= bin_points:
             held -= share[begin]
             begin += 1
         if held > most:
-            most, last = held, s
-    first = last
+            most, first, last = held, begin, k
     weight, moment = 0.0, 0.0
-    while first > last - bin_points and first >= 0 and run[first] == run[last]:
-        weight += share[first]
-        moment += share[first] * (last - first)
-        first -= 1
-    return last - round(moment / weight)
+    for k in range(first, last + 1):
+        weight += share[k]
+        moment += share[k] * (place[k] - place[first])
+    return place[first] + round(moment / weight)
 
 
 @_compile

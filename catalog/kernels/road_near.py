@@ -1,7 +1,7 @@
 """The nearest point of a road: an index of the plane around it, in which look-ups are short.
 
 Distances are in metres on the local plane (equirectangular at the place), which is right within
-a millimetre at 100 m. The plane around the road is cut in square tiles, and these in cells; each
+millimetres at 100 m. The plane around the road is cut in square tiles, and these in cells; each
 cell lists the map points that are nearest to some place in it. A point is left out of a cell when
 one other point is nearer to all four corners: then it is nearer everywhere between (the bisector of
 two points is a straight line). Away from the tiles, whole blocks of points are passed over.

@@ -225,6 +225,8 @@ def _locate(
     Returns the index of the first position that is none, or -1.
     """
     # All in one loop: a call with arrays, once for each position, would cost more than the search.
+    per_degree = 1.0 / scale[0], 1.0 / scale[1]
+    south, west, tile = np.int64(1) << 40, np.int64(0), -1
     for k in range(latitude.size):
         if abs(latitude[k]) > 90.0 or math.isinf(longitude[k]):
             return k
@@ -233,9 +235,10 @@ def _locate(
             continue
         y, x = latitude[k] - origin[0], longitude[k] - origin[1]
         x -= 360.0 * math.floor(x / 360.0 + 0.5)
-        row, column = y / scale[0], x / scale[1]
-        south, west = math.floor(row), math.floor(column)
-        tile = _tile_of(table, south, west)
+        row, column = y * per_degree[0], x * per_degree[1]
+        if not (0.0 <= row - south < 1.0 and 0.0 <= column - west < 1.0):
+            south, west = math.floor(row), math.floor(column)
+            tile = _tile_of(table, south, west)
         if tile < 0:
             far, north, east = _nearest_of_all(nodes, blocks, y, x)
             found[k, 0], found[k, 1], found[k, 2] = y, x, far
