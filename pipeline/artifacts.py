@@ -10,12 +10,11 @@ import xarray as xr
 
 from magtiles.schemas import contracts
 from magtiles.schemas.errors import ContractError, FormatError, MagtilesError
+from magtiles.stages.ingest.hdf5_checks import check_hdf5
 from magtiles.stages.release.atomic import atomic_path
 from magtiles.stages.release.tile_file import write_tile
 
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
-_DEFLATE_LIMIT = 1032
-"""The most that zlib can expand; a file that declares more data than this holds none of it."""
 
 
 def write_artifact(dataset: xr.Dataset, path: Path, contract: str) -> None:
@@ -50,22 +49,17 @@ def open_artifact(path: Path, *, cache: bool = True) -> xr.Dataset:
     """Open an artifact, its arrays loaded when first touched and kept in their stored dtype.
 
     Without `cache` every touch reads again and keeps nothing in memory. Raises FormatError
-    for a file that is missing, truncated, damaged or of another format.
+    for a file that is missing, truncated, damaged, of another format, or that `check_hdf5`
+    refuses: anybody may have made it.
     """
     _check_signature(path)
+    check_hdf5(path, kind="netCDF-4")
     try:
         dataset = xr.open_dataset(
             path, engine="netcdf4", mask_and_scale=False, decode_timedelta=False, cache=cache
         )
     except (OSError, RuntimeError, ValueError, AttributeError) as caught:
         raise _damaged(path, caught) from caught
-    if dataset.nbytes > _DEFLATE_LIMIT * path.stat().st_size:
-        dataset.close()
-        raise FormatError(
-            f"declares {dataset.nbytes} bytes of arrays in a file of {path.stat().st_size}",
-            where=path,
-            remedy="build or fetch it again",
-        )
     for variable in dataset.variables.values():
         variable.attrs |= _flags_like(variable)
     return dataset

@@ -94,8 +94,7 @@ def send_classic(path: Path, send: Sender) -> None:
     """A classic file, by SciPy: the netCDF library fills what one lacks with zeros."""
     # Mapped, so that nothing is read before its size is known to be true.
     file = netcdf_file(path, "r", mmap=True, maskandscale=False)
-    declared = sum(int(v.data.nbytes) for v in file.variables.values())
-    check_declared(declared, path.stat().st_size, path)
+    check_declared(sum(int(v.data.nbytes) for v in file.variables.values()), path)
     for name, variable in file.variables.items():
         send.variable(name, variable.dimensions, np.array(variable.data), variable._attributes)
     send.header(attrs=encoded(file._attributes))
@@ -103,7 +102,7 @@ def send_classic(path: Path, send: Sender) -> None:
 
 def send_netcdf4(path: Path, send: Sender) -> None:
     """The root group of a netCDF-4 file."""
-    check_hdf5(path, kind="netCDF")
+    check_declared(check_hdf5(path, kind="netCDF"), path)
     with netCDF4.Dataset(str(path)) as file:
         file.set_auto_maskandscale(False)
         file.set_auto_chartostring(False)
@@ -116,7 +115,7 @@ def send_netcdf4(path: Path, send: Sender) -> None:
 
 def send_hdf5(path: Path, names: Sequence[str], send: Sender) -> None:
     """The datasets `names` of an HDF5 file, and the names of all others."""
-    check_hdf5(path)
+    check_declared(check_hdf5(path), path)
     with h5py.File(path, "r") as file:
         for name, dataset in _datasets(file):
             values = _values(dataset) if name in names else None

@@ -27,33 +27,38 @@ _BUILT_IN_FILTERS = {
 }
 
 
-def check_hdf5(path: Path, *, kind: str = "HDF5") -> None:
+def check_hdf5(path: Path, *, kind: str = "HDF5") -> int:
     """Raise FormatError unless everything in an HDF5 file lies in the file itself.
 
     Refused are external storage, virtual datasets, links other than hard ones, filters that are
-    not part of HDF5, and arrays larger than the file can hold or than `MAX_ARRAY_BYTES`. No
-    array is read. `kind` is what messages call the file.
+    not part of HDF5, and arrays larger than the file can hold. No array is read. `kind` is what
+    messages call the file.
+
+    Returns
+    -------
+    The bytes that all arrays declare.
     """
     try:
         with h5py.File(path, "r") as file:
             declared = _walk(file, path)
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as caught:
         raise FormatError(
-            f"is not a whole {kind} file: {str(caught).replace(str(path), path.name)[:200]}",
+            f"is not a whole {kind} file: truncated or damaged "
+            f"({str(caught).replace(str(path), path.name)[:200]})",
             where=path,
             remedy="fetch it again",
         ) from None
-    check_declared(declared, path.stat().st_size * _DEFLATE_LIMIT, path)
-
-
-def check_declared(declared: int, most: int, where: object) -> None:
-    """Raise FormatError where arrays of `declared` bytes cannot be true or are too many."""
-    if declared > most:
+    if declared > path.stat().st_size * _DEFLATE_LIMIT:
         raise FormatError(
             f"declares {declared} bytes of arrays, more than a file of its size can hold",
-            where=where,
+            where=path,
             remedy="fetch it again",
         )
+    return declared
+
+
+def check_declared(declared: int, where: object) -> None:
+    """Raise FormatError where the arrays of a foreign file are larger than `MAX_ARRAY_BYTES`."""
     if declared > MAX_ARRAY_BYTES:
         raise FormatError(
             f"declares {declared} bytes of arrays",
