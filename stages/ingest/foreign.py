@@ -132,10 +132,10 @@ def _exactly(stream: IO[bytes], size: int) -> bytes:
 
 
 def _fill(stream: IO[bytes], values: NDArray[Any]) -> None:
-    view = values.reshape(-1).view(np.uint8) if values.size else values.reshape(-1)
     done = 0
     while done < values.nbytes:
-        got = stream.readinto(memoryview(view)[done:])  # type: ignore[attr-defined]
+        rest = values.reshape(-1).view(np.uint8)[done:].data
+        got = stream.readinto(rest)  # type: ignore[attr-defined]
         if not got:
             raise EOFError
         done += got

@@ -71,7 +71,8 @@ class Sender:
         self.header(
             name=name, dims=list(dims), dtype=plain.dtype.str, shape=shape, attrs=encoded(attrs)
         )
-        self._out.write(plain.tobytes() if plain.ndim == 0 else memoryview(plain).cast("B"))
+        if plain.size:
+            self._out.write(plain.reshape(-1).view(np.uint8).data)
 
 
 def encoded(attrs: Mapping[str, Any]) -> dict[str, Any]:
