@@ -45,7 +45,7 @@ def curves(months: np.ndarray = MONTHS) -> xr.Dataset:
     vector = quiet_curve(np.arange(1440.0))[:, None]
     baseline = np.concatenate([np.repeat(vector, len(months), axis=1), np.zeros((1, 2, 1440))])
     place = {"latitude": 40.137, "longitude": LONGITUDE, "elevation": 1682.0, "dip_latitude": 49.0}
-    units = {"elevation": "m", "longitude": "degrees_east"}
+    units = {"elevation": "m", "longitude": "degrees_east", "dip_latitude": "degree"}
     minutes = ("observatory", "element", "month", "minute")
     nt = {"units": "nT"}
     return xr.Dataset(
