@@ -29,6 +29,7 @@ MOST = {
     "rank": 31,
     "segment": 10_000_000,
     "class": 1000,
+    "predicted": 16,
 }
 """Largest size of each dimension."""
 
@@ -91,6 +92,12 @@ TEMPORAL_VARIABLES: dict[str, TemporalVariable] = {
     "sigma_about_mean": _fitted(_OF_SEGMENT, "nT", "sigma about the segment's mean"),
     "tau_about_mean": _fitted(_OF_SEGMENT, "s", "tau about the segment's mean"),
     "valid_fraction": _fitted(_OF_SEGMENT, "1", "share of the segment's samples that are there"),
+    "predicted": TemporalVariable(("predicted",), ("str",), None, "what persistence is of"),
+    "persistence": _fitted(
+        ("observatory", "element", "predicted"),
+        "1",
+        "rms error of the last segment as prediction, over that of the average",
+    ),
     "class_kp": _code("activity: 0 quiet, 1 stormy (Kp >= 3), -1 any"),
     "class_season": _code("season of the hemisphere: 0 winter, 1 equinox, 2 summer, -1 any"),
     "class_local_time": _code("quarter of the local day from midnight: 0 to 3, -1 any"),

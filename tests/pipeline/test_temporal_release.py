@@ -118,6 +118,19 @@ def test_a_storm_makes_sigma_large_only_where_it_was(release: Release) -> None:
     assert stormy > 15.0
 
 
+def test_how_well_segments_predict_the_next_is_kept(release: Release) -> None:
+    held = release.temporal.variables
+    assert held["predicted"].tolist() == [
+        "level", "sigma", "tau", "sigma_autocorrelation", "tau_autocorrelation"
+    ]  # fmt: skip
+    ratio = held["persistence"]
+    assert ratio.shape == (2, 4, 5)
+    # sigma changes with the storm, of which the last segment tells (measured 0.70 to 0.88);
+    # outside it segments are independent, so that tau is better taken from the average of all.
+    assert (ratio[:, :, 1] < 0.95).all()
+    assert (ratio[:, :, 4] > 1.2).all()
+
+
 def test_the_release_validates_and_names_its_temporal_checks(built: Built) -> None:
     checks = {c.name: c for c in validate_release(built.store / "demo/1.0.0")}
     assert all(check.passed for check in checks.values())
