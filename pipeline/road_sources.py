@@ -37,10 +37,22 @@ class RoadsTable(Params):
     calibration_method: Literal[
         "swinging", "strict-ellipse", "modified-ellipsoid", "ellipsoid", "attitude"
     ] = quantity("1", default="modified-ellipsoid", doc="Method of calibrate-vector.")
+    attitude_lag_s: float | None = quantity(
+        "s", default=None, doc="Of align-log: lag of the attitude; default estimated."
+    )
+    fix_lag_s: float | None = quantity(
+        "s", default=None, doc="Of align-log: lag of the fixes; default estimated."
+    )
     spacing_m: float = quantity("m", default=1.0, gt=0, doc="Distance between the map's points.")
     split: bool = quantity(
         "1", default=True, doc="Split the drives into roads at junctions, U-turns and gaps."
     )
+
+    @property
+    def lags(self) -> dict[str, float]:
+        """The lags that are stated, as align-log takes them."""
+        stated = {"attitude_lag_s": self.attitude_lag_s, "fix_lag_s": self.fix_lag_s}
+        return {name: lag for name, lag in stated.items() if lag is not None}
 
 
 @dataclass(frozen=True)

@@ -47,21 +47,22 @@ class _Tracks:
             self.artifacts.append(self._steps.run(stage, inputs, out, params))
         return out
 
-    def aligned(self, source: Source[Any]) -> Path:
+    def aligned(self, source: Source[Any], table: RoadsTable) -> Path:
         name = source.source.id
         files = [source.path, *data_files(source, self._data)]
         log = self.run(ingest_log.STAGE, {"files": files}, f"{name}-log", {})
-        return self.run(align.STAGE, {"track": log}, f"{name}-aligned", {})
+        stated = "".join(f"-{key}={lag:g}" for key, lag in table.lags.items())
+        return self.run(align.STAGE, {"track": log}, f"{name}-aligned{stated}", table.lags)
 
-    def calibrated(self, source: Source[Any], by: Source[Any] | None, method: str) -> Path:
-        track = self.aligned(source)
+    def calibrated(self, source: Source[Any], by: Source[Any] | None, table: RoadsTable) -> Path:
+        track, method = self.aligned(source, table), table.calibration_method
         if by is None:
             return track
-        inputs = {"track": self.aligned(by)}
-        how = f"{by.source.id}-{method}"
-        made = self.run(calibrate.STAGE, inputs, f"{how}-calibration", {"method": method})
+        circles = self.aligned(by, table)
+        name = f"{circles.stem}-{method}"
+        made = self.run(calibrate.STAGE, {"track": circles}, name, {"method": method})
         inputs = {"track": track, "calibration": made}
-        return self.run(apply.STAGE, inputs, f"{source.source.id}-by-{how}", {})
+        return self.run(apply.STAGE, inputs, f"{track.stem}-by-{name}", {})
 
 
 def build_roads(
@@ -118,9 +119,7 @@ def _maps(roads: RoadSources, tracks: _Tracks) -> Iterator[Path]:
     table = roads.table
     drives = [
         _Drive(
-            vehicle,
-            log.source.id,
-            tracks.calibrated(log, roads.calibration.get(vehicle), table.calibration_method),
+            vehicle, log.source.id, tracks.calibrated(log, roads.calibration.get(vehicle), table)
         )
         for vehicle, logs in roads.logs.items()
         for log in logs

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,16 +38,20 @@ _NO_DATA = -999999.0
 
 
 def write_sample(
-    folder: Path, spec: SampleSpec = DEMO, temporal: TemporalSample | None = None
+    folder: Path,
+    spec: SampleSpec = DEMO,
+    temporal: TemporalSample | None = None,
+    roads: Sequence[str] = (),
 ) -> list[Path]:
     """Write survey, source TOML, product TOML and truth of a spec; the same bytes every time.
 
     Returns the paths ``<name>-survey.tif``, ``<name>-survey.toml``, ``<name>.toml`` and
     ``<name>-truth.nc``, then those of `write_flight`; with a `temporal` sample those of
-    `write_observatories` and ``<name>-temporal-truth.nc``. Existing files are replaced whole.
+    `write_observatories` and ``<name>-temporal-truth.nc``. `roads` are lines of the product's
+    [[roads]] tables. Existing files are replaced whole.
     """
     sample = synthesize(spec)
-    paths = write_survey(folder, sample, temporal)
+    paths = write_survey(folder, sample, temporal, roads)
     truth = folder / f"{spec.name}-truth.nc"
     dataset = truth_dataset(sample)
     packing = {"zlib": True, "complevel": 1, "shuffle": True}
@@ -64,17 +69,20 @@ def write_sample(
 
 
 def write_survey(
-    folder: Path, sample: Sample, temporal: TemporalSample | None = None
+    folder: Path,
+    sample: Sample,
+    temporal: TemporalSample | None = None,
+    roads: Sequence[str] = (),
 ) -> list[Path]:
     """Write a sample without its truth: survey GeoTIFF, source TOML, product TOML.
 
-    With a `temporal` sample also the files of `write_observatories`, which the product names.
+    With a `temporal` sample also the files of `write_observatories`, which the product names;
+    `roads` as of `write_sample`.
     """
     folder.mkdir(parents=True, exist_ok=True)
     spec = sample.spec
-    product = _product_toml(spec)
-    if temporal is not None:
-        product += "\n".join(temporal_table(spec.name, temporal)) + "\n"
+    lines = [*roads] if temporal is None else [*temporal_table(spec.name, temporal), *roads]
+    product = _product_toml(spec) + "".join(f"{line}\n" for line in lines)
     contents = {
         f"{spec.name}-survey.tif": _geotiff(sample),
         f"{spec.name}-survey.toml": _source_toml(spec).encode(),

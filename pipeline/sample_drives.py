@@ -28,7 +28,8 @@ from magtiles.stages.release.atomic import atomic_path
 Floats = NDArray[np.float64]
 
 DATE = "2024-05-06"
-VEHICLES = (TRUCK, SUV, CAR, REFERENCE)
+MAPPING = (TRUCK, SUV, CAR)
+VEHICLES = (*MAPPING, REFERENCE)
 PASSES = 3
 
 _LANE_M, _U_TURN_M = 3.5, 6.0
@@ -128,6 +129,22 @@ def write_drives(folder: Path, roads: Iterable[Road] = ROADS) -> list[Path]:
         for vehicle, number in passes(road):
             paths += _write_drive(folder, road, vehicle, number)
     return paths
+
+
+def roads_tables(folder: str) -> list[str]:
+    """The [[roads]] tables of a product of the drives in `folder`, over loop and road, as lines."""
+    lines = []
+    for road, split in ((LOOP, "false"), (ROAD, "true")):
+        name = road.route.name
+        lines += ["", "[[roads]]", f'name = "{name}"', f"split = {split}"]
+        lines += ["attitude_lag_s = 0.0", "fix_lag_s = 0.0", "[roads.logs]"]
+        for vehicle in MAPPING:
+            logs = (f'"{folder}/{vehicle.name}-{name}-{n + 1}.toml"' for n in range(PASSES))
+            lines.append(f"{vehicle.name} = [{', '.join(logs)}]")
+        lines.append("[roads.calibration]")
+        for vehicle in MAPPING:
+            lines.append(f'{vehicle.name} = "{folder}/{vehicle.name}-{LOT.route.name}-1.toml"')
+    return lines
 
 
 def passes(road: Road) -> Iterator[tuple[Vehicle, int]]:

@@ -18,12 +18,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Write the samples and list their files."""
     from magtiles.pipeline.sample import write_sample
-    from magtiles.pipeline.sample_drives import ROADS, SUBURB, write_drives
+    from magtiles.pipeline.sample_drives import ROADS, SUBURB, roads_tables, write_drives
     from magtiles.pipeline.sample_model import write_world
     from magtiles.pipeline.synthetic_observatories import TemporalSample
 
     folder: Path = arguments.folder
-    survey = write_sample(folder, temporal=TemporalSample())
+    survey = write_sample(folder, temporal=TemporalSample(), roads=roads_tables("drives"))
     roads = (*ROADS, SUBURB) if arguments.suburb else ROADS
     for path in [*survey, *write_world(folder), *write_drives(folder / "drives", roads)]:
         print(path)

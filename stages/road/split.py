@@ -23,6 +23,7 @@ _TURN_M = 30.0
 """Length over which a turn is one."""
 _U_TURN_DEG = 150.0
 _U_TURN_M = 60.0
+_STRAIGHT_DEG = 20.0
 _PARALLEL_DEG = 30.0
 _COURSE_STEPS = 5
 """To either side, over which the course of a drive is compared with that of another visit: fixes
@@ -80,9 +81,9 @@ class DrivePart:
 def split_drive(track: xr.Dataset, *, params: SplitParams) -> list[DrivePart]:
     """The parts of a drive (track/1), in order of time.
 
-    A drive is cut where it turns sharply or back, where it comes to, crosses or leaves a road
-    that it drives another time, and at gaps. Parts along the same stretch get one number.
-    Raises as `motion_of`.
+    A drive is cut where it turns sharply, where it comes to, crosses or leaves a road that it
+    drives another time, and at gaps and U-turns, which belong to no part. Parts along the same
+    stretch get one number. Raises as `motion_of`.
     """
     motion = motion_of(
         track, position_sigma_m=params.position_sigma_m, standstill_m_s=params.standstill_m_s
@@ -117,7 +118,7 @@ class _Shape:
 
 def _parts(motion: Motion, track: xr.Dataset, params: SplitParams) -> list[DrivePart]:
     shape = _shape(motion, track)
-    lost = _gaps(motion, track, params)
+    lost = np.concatenate([_gaps(motion, track, params), _u_turns(shape)])
     cuts = _merged(np.concatenate([_turns(shape, params), _visits(shape, params)]), params)
     ends = np.concatenate([[shape.distance[0], shape.distance[-1]], lost.ravel()])
     bounds = np.unique(np.concatenate([ends, cuts]))
@@ -158,12 +159,24 @@ def _gaps(motion: Motion, track: xr.Dataset, params: SplitParams) -> Real:
 
 
 def _turns(shape: _Shape, params: SplitParams) -> Real:
-    """Distances of the middle of sharp turns and U-turns."""
-    found = [
-        _peaks(np.abs(_turned(shape.course, int(length / _STEP_M))), np.radians(limit))
-        for length, limit in ((_TURN_M, params.turn_deg), (_U_TURN_M, _U_TURN_DEG))
-    ]
-    return shape.distance[np.concatenate(found)]
+    """Distances of the middle of sharp turns."""
+    turned = np.abs(_turned(shape.course, int(_TURN_M / _STEP_M)))
+    return shape.distance[_peaks(turned, np.radians(params.turn_deg))]
+
+
+def _u_turns(shape: _Shape) -> Real:
+    """Distances (n, 2) between which the drive turns back: from leaving one course to the other."""
+    steps = int(_U_TURN_M / _STEP_M)
+    found = []
+    for peak in _peaks(np.abs(_turned(shape.course, steps)), np.radians(_U_TURN_DEG)):
+        around = np.arange(
+            max(peak - steps // 2, 0), min(peak + steps // 2, len(shape.course) - 1) + 1
+        )
+        course = shape.course[around]
+        left = around[np.abs(course - course[0]) > np.radians(_STRAIGHT_DEG)]
+        joined = around[np.abs(course - course[-1]) > np.radians(_STRAIGHT_DEG)]
+        found.append(shape.distance[[left[0], joined[-1]]])
+    return np.array(found).reshape(-1, 2)
 
 
 def _turned(course: Real, steps: int) -> Real:

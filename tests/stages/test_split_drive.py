@@ -28,12 +28,12 @@ CASES = [
     Expect(
         "U-turn",
         [(0, 0), (400, 0), (400, 8), (0, 8)],
-        [(0, "forward", 404), (0, "backward", 404)],
+        [(0, "forward", 396), (0, "backward", 396)],
     ),
     Expect(
         "U-turn, and a fix that wanders at a light",
         [(0, 0), (200, 0), (203, 3), (400, 3), (400, -5), (0, -5)],
-        [(0, "forward", 405), (0, "backward", 405)],
+        [(0, "forward", 396), (0, "backward", 396)],
     ),
     Expect(
         "two laps",
