@@ -34,6 +34,7 @@ _MOVING_MPS = 2.0
 """Below, the course between fixes is noise."""
 _CHORD_S = 1.0
 """Course is that from so long before to so long after; noise of fixes hides it over less."""
+_TOO_LITTLE = "too little turning, or no vector field"
 _OWN = TrackFlag.NO_FIX | TrackFlag.POSITION_GAP | TrackFlag.FIX_OUTLIER | TrackFlag.STATIONARY
 _DOUBTFUL = TrackFlag.FIELD_GAP | TrackFlag.FIELD_SPIKE | TrackFlag.CLOCK_STEP
 
@@ -47,7 +48,14 @@ class AlignLogParams(Params):
         doc="How much later the attitude is stamped than the field; default estimated.",
     )
     fix_lag_s: float | None = quantity(
-        "s", default=None, doc="How much later fixes are stamped than the field; default estimated."
+        "s",
+        default=None,
+        doc="How much later fixes are stamped than the field; default estimated or zero.",
+    )
+    antenna_ahead_m: float | None = quantity(
+        "m",
+        default=None,
+        doc="From the middle of the rear axle forward to the antenna; estimates the fixes' lag.",
     )
     max_lag_s: float = quantity("s", default=1.0, gt=0, le=30, doc="Greatest lag to look for.")
     max_gap_s: float | None = quantity(
@@ -79,7 +87,9 @@ def align_log(track: xr.Dataset, *, params: AlignLogParams) -> xr.Dataset:
     A lag is that at which one sensor explains another best by least squares: the attitude, by
     the nine elements of its rotation, the vector field; the course between fixes where the body
     points, or the field where no attitude is known. No calibration of the magnetometer is
-    needed. Where a lag cannot be told it is taken as zero, with a warning. The attributes
+    needed. In a turn the course of an antenna ahead of the rear axle leads, as if stamped early
+    by the distance over the speed: the lag of fixes is estimated if `antenna_ahead_m` is stated.
+    Where a lag cannot be told it is taken as zero, with a warning. The attributes
     `attitude_lag_s`, `fix_lag_s`, their `_sigma_s` and `_origin` (estimated, stated, not
     observable) record it. Fixes and attitude samples stay as the log has them, so that the stage
     may run again.
@@ -134,13 +144,15 @@ class _Applied:
 _ABSENT = _Applied(0.0, np.nan, None)
 
 
-def _applied(sensor: str, stated: float | None, found: Lag | None) -> _Applied:
+def _applied(
+    sensor: str, stated: float | None, found: Lag | None, why: str = _TOO_LITTLE
+) -> _Applied:
     if stated is not None:
         return _Applied(stated, np.nan, "stated")
     if found is None:
         _LOG.warning(
-            "the lag of the %s cannot be told from this track (too little turning, or no vector "
-            "field); taken as zero: state it with '%s_lag_s'", sensor, sensor,
+            "the lag of the %s cannot be told from this track (%s); taken as zero: state it with "
+            "'%s_lag_s'", sensor, why, sensor,
         )  # fmt: skip
         return _Applied(0.0, np.nan, "not observable")
     _LOG.info(
@@ -176,20 +188,36 @@ def _fix_lag(
     seen = None if attitude is None else _matrices(attitude)[:, [0, 3]]
     if seen is None and "field_body" in track:
         seen = track["field_body"].values.astype(np.float64)
-    good, found = fixes.valid, None
-    if params.fix_lag_s is None and seen is not None and good.sum() > 2:
+    good, found, ahead = fixes.valid, None, params.antenna_ahead_m
+    if params.fix_lag_s is None and ahead is not None and seen is not None and good.sum() > 2:
         way = way_of(fixes.time[good], fixes.latitude[good], fixes.longitude[good])
-        usual = float(np.median(np.diff(way.seconds)))
-        course = way.chord(way.seconds, max(_CHORD_S, usual))
-        speed = np.linalg.norm(course, axis=1, keepdims=True)
-        moving = speed > _MOVING_MPS
-        course = np.where(moving, course / np.where(moving, speed, 1.0), np.nan)
-        found = estimate_lag(
-            _undoubted(track, seen, params),
-            Samples(_seconds(track, fixes.time[good]), course, 2.0 * _max_gap(track, params)),
-            max_lag_s=params.max_lag_s,
-        )
-    return _applied("fix", params.fix_lag_s, found)
+        way = replace(way, seconds=_seconds(track, fixes.time[good]))
+        found = _lag_of_course(_undoubted(track, seen, params), way, ahead, params)
+    why = _TOO_LITTLE if ahead is not None else "'antenna_ahead_m' is not stated"
+    return _applied("fix", params.fix_lag_s, found, why)
+
+
+def _lag_of_course(seen: Samples, way: Way, ahead_m: float, params: AlignLogParams) -> Lag | None:
+    """Of the course along a way behind what was seen to turn; seconds of both have one zero.
+
+    The course of an antenna ahead of the point that goes where the body points leads by that
+    distance times the turning, over the speed.
+    """
+    half_s = max(_CHORD_S, float(np.median(np.diff(way.seconds))))
+    velocity = way.chord(way.seconds, half_s)
+    speed = np.linalg.norm(velocity, axis=1)
+    moving = speed > _MOVING_MPS
+    seen = seen.known()
+    if moving.sum() < 2 or seen.seconds.size < 2:
+        return None
+    course = velocity / np.where(moving, speed, np.nan)[:, None]
+    turning = np.gradient(seen.values, seen.seconds, axis=0)
+    leads = ahead_m / np.interp(seen.seconds, way.seconds[moving], speed[moving])
+    return estimate_lag(
+        replace(seen, values=seen.values + leads[:, None] * turning),
+        Samples(way.seconds, course, 2.0 * seen.max_gap_s),
+        max_lag_s=params.max_lag_s,
+    )
 
 
 def _undoubted(track: xr.Dataset, values: Real, params: AlignLogParams) -> Samples:

@@ -11,6 +11,7 @@ import xarray as xr
 from scipy.spatial.transform import Rotation
 
 from magtiles.catalog.flags import TrackFlag
+from magtiles.catalog.kernels.geodesy import metres_per_degree
 from magtiles.schemas import contracts
 from magtiles.schemas.errors import ContractError, SourceError
 from magtiles.stages.declare import parse_params
@@ -21,6 +22,7 @@ from magtiles.stages.vehicle.lag import Samples, estimate_lag
 
 def align(track: xr.Dataset, **params: Any) -> xr.Dataset:
     contracts.check(track, "track/1")
+    params = {"antenna_ahead_m": 0.0} | params
     made = align_log(track, params=parse_params(AlignLogParams, params, where="parameters"))
     contracts.check(made, "track/1")
     return made
@@ -101,6 +103,36 @@ def test_the_field_stands_in_where_no_attitude_is_known() -> None:
         found[hills] = made.attrs
     assert abs(found[0.0]["fix_lag_s"] - 0.3) < 4e-3
     assert found[1.0]["fix_lag_origin"] == "not observable"
+
+
+def with_antenna_ahead(track: xr.Dataset, metres: float) -> xr.Dataset:
+    """The fixes moved forward along the body's axis."""
+    heading = truth.heading((track["fix_time"].values - truth.START) / np.timedelta64(1, "s"))
+    per_latitude, per_longitude = metres_per_degree(np.array(truth.ORIGIN[0]), 0.0)
+    return track.assign(
+        fix_latitude=track["fix_latitude"] + metres * np.cos(heading) / per_latitude,
+        fix_longitude=track["fix_longitude"] + metres * np.sin(heading) / per_longitude,
+    )
+
+
+@pytest.mark.parametrize("has_attitude", [True, False])
+def test_an_antenna_ahead_of_the_axle_is_no_lag(has_attitude: bool) -> None:
+    """Its course leads in turns: by 1.8 m / 8 m/s, did the fit not know of it."""
+    track = with_antenna_ahead(truth.drive(hills=0.0, field_noise_nt=200.0, fix_noise_m=0.2), 1.8)
+    if not has_attitude:
+        track = track.drop_dims("attitude_sample").drop_vars("attitude")
+    assert abs(align(track, antenna_ahead_m=1.8).attrs["fix_lag_s"]) < 6e-3  # found 3e-3
+    assert align(track).attrs["fix_lag_s"] == pytest.approx(-1.8 / 8.0, abs=0.02)
+
+
+def test_the_lag_of_fixes_is_not_guessed_without_the_antennas_place(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    made = align(truth.drive(fix_lag_s=0.18), antenna_ahead_m=None)
+    assert made.attrs["fix_lag_s"] == 0.0
+    assert made.attrs["fix_lag_origin"] == "not observable"
+    assert "'antenna_ahead_m' is not stated" in caplog.text
+    assert "state it with 'fix_lag_s'" in caplog.text
 
 
 def test_what_cannot_be_told_is_said(caplog: pytest.LogCaptureFixture) -> None:
