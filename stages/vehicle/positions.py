@@ -16,6 +16,9 @@ Real = NDArray[np.float64]
 Times = NDArray[np.datetime64]
 """datetime64[ns], UTC."""
 
+_BLOCK = 65_536
+"""Rows at a time, so that a long log needs little memory beside its own columns."""
+
 
 @dataclass(frozen=True)
 class Fixes:
@@ -78,28 +81,49 @@ def positions_at(time: Times, fixes: Fixes, *, max_gap_s: float) -> Positions:
     (NO_FIX). Linear in degrees: 100 m between fixes bend by less than a millimetre below 80
     degrees of latitude.
     """
+    place, flag = np.full((3, time.size), np.nan), np.zeros(time.size, dtype=np.uint16)
     good = fixes.valid
-    flag = np.zeros(time.size, dtype=np.uint16)
-    place = np.full((3, time.size), np.nan)
     if not good.any():
-        return Positions(place[0], place[1], place[2], flag | np.uint16(TrackFlag.NO_FIX))
-    at = fixes.time[good]
+        return Positions(*place, flag | np.uint16(TrackFlag.NO_FIX))
+    turns = np.degrees(np.unwrap(np.radians(fixes.longitude[good])))
+    known = _Known(
+        fixes.time[good],
+        np.stack([fixes.latitude[good], turns, fixes.height[good]]),
+        np.concatenate([[0], np.cumsum(~good)])[np.flatnonzero(good)],
+    )
+    for start in range(0, time.size, _BLOCK):
+        rows = slice(start, start + _BLOCK)
+        place[:, rows], flag[rows] = _placed(time[rows], known, max_gap_s)
+    latitude, longitude, height = place
+    return Positions(latitude, wrap_longitude(longitude), height, flag)
+
+
+@dataclass(frozen=True)
+class _Known:
+    """Valid fixes: times (n,), places (3, n), and how many invalid ones came before each (n,)."""
+
+    time: Times
+    place: Real
+    refusals: NDArray[np.int64]
+
+
+def _placed(time: Times, fixes: _Known, max_gap_s: float) -> tuple[Real, NDArray[np.uint16]]:
+    """Places (3, m), longitudes unwrapped, and flags (m,) at `time` (m,)."""
+    at, refusals = fixes.time, fixes.refusals
+    place, flag = np.full((3, time.size), np.nan), np.zeros(time.size, dtype=np.uint16)
     outside = (time < at[0]) | (time > at[-1])
     after = np.minimum(np.maximum(np.searchsorted(at, time), 1), at.size - 1)
     before = np.maximum(after - 1, 0)
     after[time == at[before]] = before[time == at[before]]  # on a fix no gap matters
     before[time == at[after]] = after[time == at[after]]
     wide = _seconds(at[after] - at[before]) > max_gap_s
-    refusals = np.concatenate([[0], np.cumsum(~good)])[np.searchsorted(fixes.time, at)]
     lost = wide & (refusals[after] > refusals[before])
     flag[outside | lost] |= TrackFlag.NO_FIX.value
     flag[wide & ~lost & ~outside] |= TrackFlag.POSITION_GAP.value
     known = ~(outside | wide)
-    turns = np.degrees(np.unwrap(np.radians(fixes.longitude[good])))
-    for row, values in zip(place, (fixes.latitude[good], turns, fixes.height[good]), strict=True):
+    for row, values in zip(place, fixes.place, strict=True):
         row[known] = _between(time[known], at, values, before[known], after[known])
-    latitude, longitude, height = place
-    return Positions(latitude, wrap_longitude(longitude), height, flag)
+    return place, flag
 
 
 def attitude_at(time: Times, attitudes: Attitudes, *, max_gap_s: float) -> Real:

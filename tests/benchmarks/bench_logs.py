@@ -16,6 +16,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import xarray as xr
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from mcap_ros2.decoder import DecoderFactory
@@ -27,6 +28,7 @@ from logs import MAGNETIC_FIELD, NAV_SAT_FIX, SECOND, START
 from magtiles.stages.ingest.log.mcap_log import read_mcap
 from magtiles.stages.ingest.log.raw import RawLog
 from magtiles.stages.ingest.log.source import IngestLogParams
+from magtiles.stages.ingest.log.stage import ingest_log
 
 MESSAGES = 1_000_000
 ROUNDS = 3
@@ -88,23 +90,32 @@ def timed(work: object, path: Path) -> float:
     return time.perf_counter() - start
 
 
-def peak_of_a_child(path: Path, small: Path) -> tuple[float, float]:
+def whole(path: Path) -> xr.Dataset:
+    """The stage: a track with places."""
+    return ingest_log([path], params=IngestLogParams())
+
+
+def peak_of_a_child(work: str, path: Path, small: Path) -> tuple[float, float]:
     """Bytes that one reading adds to a process that has read a small log, and of its columns."""
     child = subprocess.run(
-        [sys.executable, __file__, "--child", str(path), str(small)],
+        [sys.executable, __file__, "--child", work, str(path), str(small)],
         capture_output=True, text=True, check=True,
     )  # fmt: skip
     added, columns = map(float, child.stdout.split())
     return added, columns
 
 
-def report_peak(path: Path, small: Path) -> None:
-    ours(small)
+def report_peak(work: str, path: Path, small: Path) -> None:
+    read = ours if work == "ours" else whole
+    read(small)
     Path("/proc/self/clear_refs").write_text("5")  # forgets the peak of importing and compiling
     before = highest_resident_kb()
-    log = ours(path)
+    log = read(path)
     added = 1024 * (highest_resident_kb() - before)
-    print(added, log.samples.time.nbytes + log.samples.values.nbytes)
+    if isinstance(log, xr.Dataset):
+        print(added, log.nbytes)
+    else:
+        print(added, log.samples.time.nbytes + log.samples.values.nbytes)
 
 
 def highest_resident_kb() -> int:
@@ -129,13 +140,14 @@ def bench(folder: Path, *, mixed: bool) -> None:
     if sys.platform != "linux":
         print("peak of memory: measured on Linux only")
         return
-    added, columns = peak_of_a_child(path, small)
-    print(f"peak {added / columns:.2f} times the {columns / 1e6:.0f} MB of columns (asked: 3)")
+    for work, made in (("ours", "columns"), ("whole", "the track of the whole stage")):
+        added, columns = peak_of_a_child(work, path, small)
+        print(f"peak {added / columns:.2f} times the {columns / 1e6:.0f} MB of {made} (asked: 3)")
 
 
 if __name__ == "__main__":
     if "--child" in sys.argv:
-        report_peak(*map(Path, sys.argv[2:4]))
+        report_peak(sys.argv[2], *map(Path, sys.argv[3:5]))
     else:
         for is_mixed in (False, True):
             with tempfile.TemporaryDirectory() as name:
