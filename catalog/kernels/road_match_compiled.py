@@ -142,7 +142,7 @@ def _best_bin(
     for k in range(first, last + 1):
         weight += share[k]
         moment += share[k] * (place[k] - place[first])
-    return place[first] + round(moment / weight)
+    return int(place[first] + round(moment / weight))
 
 
 @_compile

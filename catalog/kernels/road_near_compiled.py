@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -257,7 +258,7 @@ def _locate(
 @_compile
 def _foot(
     nodes: Floats, best: int, y: float, x: float, north: float, east: float
-) -> tuple[int, float, float]:
+) -> tuple[np.int64, float, float]:
     """Nearest place on the two lines at a point: start of the line, share, distance squared."""
     start, share, least = np.int64(best), 0.0, math.inf
     for j in range(np.uint64(max(best - 1, 0)), np.uint64(min(best + 1, nodes.shape[0] - 1))):
@@ -361,7 +362,7 @@ def log_likelihood(
 
 
 @_compile
-def _misfit(values: Floats, j: int, share: float, section: Floats, i: int) -> float:
+def _misfit(values: Floats, j: int, share: float, section: Floats, i: int) -> Any:
     """Weighted squared errors of sample i, and the logarithm of the variances' product."""
     k = j + 1
     d0 = section[i, 0] - (values[j, 0] + share * (values[k, 0] - values[j, 0]))

@@ -134,7 +134,7 @@ def mean_absolute_deviation(
             where="step_m",
             expected=f"at most {_MOST_SHIFTS}",
         )
-    shift = step_m * np.arange(-count, count + 1)
+    shift = step_m * np.arange(-count, count + 1, dtype=np.float64)
     north, east = metres_per_degree(lat, 0.0)
     total = np.zeros((shift.size, shift.size))
     for k in range(wanted.size):

@@ -106,7 +106,8 @@ class Road:
 
         shape, (lat, lon) = broadcast(latitude=latitude, longitude=longitude)
         place, offset = np.empty(lat.size), np.empty(lat.size)
-        if kernels.nearest(*self._index_arrays, lat, lon, place, offset) >= 0:
+        arguments: Any = (*self._index_arrays, lat, lon, place, offset)
+        if kernels.nearest(*arguments) >= 0:
             check_positions(shape, lat, lon)
         return Nearest(self._distance_of(place).reshape(shape)[()], offset.reshape(shape)[()])
 
@@ -150,7 +151,7 @@ class Road:
         samples = self._samples(section, form)
         start, stop = self._window(len(samples), within)
         found = self._section_map(form, self._noise(noise_nt)).log_likelihood(samples, start, stop)
-        last = np.arange(start, stop) + len(samples) - 1.0
+        last = np.arange(start, stop, dtype=np.float64) + (len(samples) - 1)
         if self.direction == "backward":
             last, found = last[::-1], found[::-1]
         return SectionLikelihood(self._distance_of(last), found)
@@ -232,10 +233,10 @@ class Road:
         shape, lat, lon = _flat(latitude, longitude)
         answer = np.empty(lat.size)
         values = self._gaussian(self._noise(noise_nt))
-        bad = kernels.log_likelihood(
+        arguments: Any = (
             *self._index_arrays, lat, lon, values, samples, lateral_sigma_m**-2.0, answer
-        )
-        if bad >= 0:
+        )  # fmt: skip
+        if kernels.log_likelihood(*arguments) >= 0:
             check_positions(shape, lat, lon)
         return answer.reshape(shape)[()]
 
@@ -280,7 +281,7 @@ class Road:
         return np.zeros(self.distance.size, np.int64)
 
     @cached_property
-    def _index_arrays(self) -> tuple[Any, ...]:
+    def _index_arrays(self) -> Any:
         index = make_index(
             self.variables["latitude"][self._driven],
             self.variables["longitude"][self._driven],
@@ -301,8 +302,8 @@ class Road:
     def _distance_of(self, place: Floats) -> Floats:
         """Metres along the road of places counted in points from where driving begins."""
         if self.direction == "backward":
-            return self.distance[-1] - self.spacing_m * place
-        return self.distance[0] + self.spacing_m * place
+            return float(self.distance[-1]) - self.spacing_m * place
+        return float(self.distance[0]) + self.spacing_m * place
 
     def _linear(self, distance: ArrayLike, values: Floats) -> Floats:
         """Values (n, k) at distances (...,): (..., k)."""

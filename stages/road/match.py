@@ -172,6 +172,7 @@ def _examine(
     params: MatchRoadParams,
 ) -> Iterator[tuple[dict[str, Any], list[float]]]:  # fmt: skip
     """Misses of every length, form and method; of features too where both sides have them."""
+    key: dict[str, Any]
     spacing = float(one.attrs["spacing_m"])
     for length in params.section_m:
         samples = round(length / spacing) + 1
@@ -184,9 +185,9 @@ def _examine(
                 yield key, misses[:, column].tolist()
     for form in FORMS:
         found = feature_misses(maps, one, plane, sigma, form, params.feature_rms)
-        for column, method in enumerate(FEATURE_METHODS):
+        for column, name in enumerate(FEATURE_METHODS):
             if len(found):
-                key = {"section_length": np.nan, "form": form, "method": method}
+                key = {"section_length": np.nan, "form": form, "method": name}
                 yield key, found[:, column].tolist()
 
 

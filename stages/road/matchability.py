@@ -63,7 +63,7 @@ def with_matchability(
 
     Roads of each spacing are told apart among themselves. Raises as `matchability`.
     """
-    made = {}
+    made: dict[int, Floats] = {}
     for spacing in {float(r.attrs["spacing_m"]) for r in roads}:
         alike = [i for i, r in enumerate(roads) if float(r.attrs["spacing_m"]) == spacing]
         shares = matchability([roads[i] for i in alike], section_m=section_m, within_m=within_m)
