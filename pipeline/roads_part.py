@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,11 +30,16 @@ from magtiles.stages.vehicle.calibration import apply, calibrate
 
 
 class _Tracks:
-    """The tracks of logs, each made once however many roads name it."""
+    """Runs stages in a folder, each once however many roads ask for it."""
 
     def __init__(self, folder: Path, data: Path | None, steps: Steps) -> None:
         self._folder, self._data, self._steps = folder, data, steps
-        self.artifacts: list[Path] = []
+        self._made: dict[str, Path] = {}
+
+    @property
+    def artifacts(self) -> list[Path]:
+        """All that was made, in order."""
+        return list(self._made.values())
 
     def expect(self, more: int) -> None:
         """Count on more steps than were known of at first."""
@@ -42,27 +48,31 @@ class _Tracks:
     def run(
         self, stage: Stage, inputs: Mapping[str, Any], name: str, params: Mapping[str, Any]
     ) -> Path:
-        out = self._folder / f"{name}.nc"
-        if out not in self.artifacts:
-            self.artifacts.append(self._steps.run(stage, inputs, out, params))
-        return out
+        """The artifact of a stage, named `name`, or numbered where that is another's."""
+        asked = repr((stage.name, inputs, params))
+        if asked not in self._made:
+            taken = {path.stem for path in self._made.values()}
+            numbered = (f"{name}-{number}" for number in itertools.count(2))
+            free = next(n for n in itertools.chain([name], numbered) if n not in taken)
+            self._made[asked] = self._steps.run(stage, inputs, self._folder / f"{free}.nc", params)
+        return self._made[asked]
 
     def aligned(self, source: Source[Any], table: RoadsTable) -> Path:
+        """The track of a log."""
         name = source.source.id
         files = [source.path, *data_files(source, self._data)]
         log = self.run(ingest_log.STAGE, {"files": files}, f"{name}-log", {})
-        stated = "".join(f"-{key}={lag:g}" for key, lag in table.lags.items())
-        return self.run(align.STAGE, {"track": log}, f"{name}-aligned{stated}", table.lags)
+        return self.run(align.STAGE, {"track": log}, f"{name}-aligned", table.lags)
 
     def calibrated(self, source: Source[Any], by: Source[Any] | None, table: RoadsTable) -> Path:
-        track, method = self.aligned(source, table), table.calibration_method
+        """The track of a log, calibrated by that of another if there is one."""
+        track = self.aligned(source, table)
         if by is None:
             return track
-        circles = self.aligned(by, table)
-        name = f"{circles.stem}-{method}"
-        made = self.run(calibrate.STAGE, {"track": circles}, name, {"method": method})
+        circles, method = {"track": self.aligned(by, table)}, {"method": table.calibration_method}
+        made = self.run(calibrate.STAGE, circles, f"{by.source.id}-calibration", method)
         inputs = {"track": track, "calibration": made}
-        return self.run(apply.STAGE, inputs, f"{track.stem}-by-{name}", {})
+        return self.run(apply.STAGE, inputs, f"{source.source.id}-calibrated", {})
 
 
 def build_roads(
