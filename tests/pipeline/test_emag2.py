@@ -87,9 +87,9 @@ def test_low_inclination_widens_the_vector(inside, real_data: Path, tmp_path: Pa
     for ask in (anomaly, of_steep):
         vector, total = (ask.uncertainty(lat, lon, 3988.0, quantity=q) for q in ("vector", "total"))
         wider.append(vector / total)
-    # Measured: 1.9 to 3.3 times the total's, against 1.0 to 1.2.
-    assert wider[0].min() > 1.7
-    assert wider[1].max() < 1.3
+    # Measured: 1.9 to 3.3 times the total's, against 0.86 to 0.98.
+    assert wider[0].min() > 1.8
+    assert wider[1].max() < 1.0
 
 
 def test_heights_are_above_the_ellipsoid(inside) -> None:

@@ -3,21 +3,15 @@
 from __future__ import annotations
 
 import gzip
-import struct
-import zipfile
-import zlib
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import harmonica
-import netCDF4
 import numpy as np
 import pytest
-import rasterio
-import rasterio.shutil
 import xarray as xr
+from grid_files import SMALL, Rows, Writer, gdal, geosoft, in_gzip, in_zip, old_gmt, text
 
 from magtiles.schemas import contracts
 from magtiles.schemas.errors import FormatError, MagtilesError, SourceError
@@ -32,116 +26,11 @@ _SAID: dict[str, Any] = {
     "reference_epoch": "1990-01-01",
     "uncertainty_nt": 2.0,
 }
-X = 500_500.0 + 1000.0 * np.arange(4)
-Y = 5_000_500.0 + 1000.0 * np.arange(3)
-VALUES = np.arange(12.0).reshape(3, 4) - 5.25  # rows from the south
-VALUES[1, 2] = np.nan
-VALUES[0, 1] = 0.0  # a value
-
-
-def gdal(driver: str, mark: float) -> Callable[[Path], list[Path]]:
-    """A writer by GDAL, whose own the format is not."""
-
-    def write(folder: Path) -> list[Path]:
-        stored = np.where(np.isnan(VALUES), mark, VALUES)[::-1].astype(np.float32)
-        profile: dict[str, Any] = {"width": 4, "height": 3, "count": 1, "dtype": "float32"}
-        profile |= {"transform": rasterio.Affine(1000, 0, 5e5, 0, -1000, 5.003e6), "nodata": mark}
-        suffix = {"ERS": ".ers", "AAIGrid": ".asc"}.get(driver, ".grd")
-        made, path = folder / "made.tif", folder / f"grid{suffix}"
-        with rasterio.open(made, "w", driver="GTiff", **profile) as dataset:
-            dataset.write(stored, 1)
-        rasterio.shutil.copy(made, path, driver=driver)
-        return [path, path.with_suffix("")] if driver == "ERS" else [path]
-
-    return write
-
-
-def geosoft(
-    *, compressed: bool = False, along_y: bool = False, rotation: float = 0.0, dtype: str = "<f4"
-) -> Callable[[Path], list[Path]]:
-    """A grid by the published description of version 2 (512-byte header, dummies -1e32)."""
-
-    def write(folder: Path) -> list[Path]:
-        stored = np.where(np.isnan(VALUES), -1e32, VALUES)
-        stored = (stored.T if along_y else stored).astype(dtype)
-        size = stored.dtype.itemsize + (1024 if compressed else 0)
-        vectors, elements = stored.shape
-        head = struct.pack("<5i", size, 2, elements, vectors, -1 if along_y else 1)
-        head += struct.pack("<5d", 1000, 1000, X[0], Y[0], rotation) + struct.pack("<2d", 0, 1)
-        body = stored.tobytes()
-        if compressed:
-            packed = bytes(16) + zlib.compress(body)
-            body = struct.pack("<4iqi", 0, 0, 1, vectors, 512 + 16 + 12, len(packed)) + packed
-        path = folder / "grid.grd"
-        path.write_bytes(head.ljust(512, b"\0") + body)
-        return [path]
-
-    return write
-
-
-def old_gmt(*, cells: bool = False, count: int = 12) -> Callable[[Path], list[Path]]:
-    def write(folder: Path) -> list[Path]:
-        path = folder / "grid.grd"
-        half = 500.0 if cells else 0.0
-        with netCDF4.Dataset(path, "w", format="NETCDF3_CLASSIC") as dataset:
-            dataset.createDimension("side", 2)
-            dataset.createDimension("xysize", count)
-            for name, axis in (("x_range", X), ("y_range", Y)):
-                dataset.createVariable(name, "f8", ("side",))[:] = axis[0] - half, axis[-1] + half
-            dataset.createVariable("spacing", "f8", ("side",))[:] = 1000, 1000
-            dataset.createVariable("dimension", "i4", ("side",))[:] = 4, 3
-            z = dataset.createVariable("z", "f4", ("xysize",), fill_value=np.float32(np.nan))
-            z.setncatts({"scale_factor": 2.0, "add_offset": 1.0, "node_offset": int(cells)})
-            z.set_auto_scale(False)
-            z[:] = ((VALUES[::-1].ravel() - 1) / 2)[:count]
-        return [path]
-
-    return write
-
-
-def text(separator: str, head: str = "", tail: str = "") -> Callable[[Path], list[Path]]:
-    """Lines in no order, the void left out."""
-
-    def write(folder: Path) -> list[Path]:
-        lines = [
-            separator.join(f"{v:.2f}" for v in (X[i], Y[j], VALUES[j, i]))
-            for j in range(3)
-            for i in range(4)
-            if not np.isnan(VALUES[j, i])
-        ]
-        path = folder / "grid.xyz"
-        path.write_text(head + "\n".join(reversed(lines)) + "\n" + tail)
-        return [path]
-
-    return write
-
-
-def in_gzip(write: Callable[[Path], list[Path]]) -> Callable[[Path], list[Path]]:
-    def pack(folder: Path) -> list[Path]:
-        (plain,) = write(folder)
-        packed = folder / f"{plain.name}.gz"
-        packed.write_bytes(gzip.compress(plain.read_bytes()))
-        return [packed]
-
-    return pack
-
-
-def in_zip(write: Callable[[Path], list[Path]], *others: str) -> Callable[[Path], list[Path]]:
-    def pack(folder: Path) -> list[Path]:
-        packed = folder / "packed.zip"
-        with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
-            for plain in write(folder):
-                archive.write(plain, f"inner/{plain.name}")
-            for other in others:
-                archive.writestr(other, "about it")
-        return [packed]
-
-    return pack
 
 
 @dataclass(frozen=True)
 class Expect:
-    write: Callable[[Path], list[Path]]
+    write: Writer
     id: str
     keys: tuple[tuple[str, Any], ...] = ()
 
@@ -172,9 +61,9 @@ def test_a_grid_is_the_same_in_every_format(expect: Expect, tmp_path: Path) -> N
     params = IngestGridParams(crs="EPSG:32610", **(_SAID | dict(expect.keys)))
     grid = ingest_grid(expect.write(tmp_path), params=params)
     contracts.check(grid, STAGE.output)
-    np.testing.assert_array_equal(grid.magnetic_anomaly, VALUES)
-    np.testing.assert_allclose(grid.x, X, rtol=0, atol=1e-6)
-    np.testing.assert_allclose(grid.y, Y, rtol=0, atol=1e-6)
+    np.testing.assert_array_equal(grid.magnetic_anomaly, SMALL.values)
+    np.testing.assert_allclose(grid.x, SMALL.x, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(grid.y, SMALL.y, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("compressed", [False, True])
@@ -195,9 +84,9 @@ def test_a_sidecar_changes_nothing(tmp_path: Path) -> None:
         ingest_grid([path], params=said)
 
 
-def cut(write: Callable[[Path], list[Path]], share: float) -> Callable[[Path], list[Path]]:
-    def damage(folder: Path) -> list[Path]:
-        files = write(folder)
+def cut(write: Writer, share: float) -> Writer:
+    def damage(folder: Path, rows: Rows = SMALL) -> list[Path]:
+        files = write(folder, rows)
         whole = files[-1].read_bytes()
         files[-1].write_bytes(whole[: int(share * len(whole))])
         return files
@@ -205,7 +94,7 @@ def cut(write: Callable[[Path], list[Path]], share: float) -> Callable[[Path], l
     return damage
 
 
-def edited(old: str, new: str) -> Callable[[Path], list[Path]]:
+def edited(old: str, new: str) -> Writer:
     def change(folder: Path) -> list[Path]:
         (path,) = text(" ")(folder)
         path.write_text(path.read_text().replace(old, new))
@@ -216,7 +105,7 @@ def edited(old: str, new: str) -> Callable[[Path], list[Path]]:
 
 @dataclass(frozen=True)
 class Refuse:
-    write: Callable[[Path], list[Path]]
+    write: Writer
     error: type[MagtilesError]
     message: str
     id: str
