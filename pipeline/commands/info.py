@@ -1,7 +1,8 @@
-"""Say what a release or a log holds.
+"""Say what a release, an artifact or a log holds.
 
-Of a release its identity, coverage, levels, accuracy, flags, files and inputs; of a log (MCAP or
-PX4 ULog) its topics with schemas, rates, span and first values.
+Of a release its identity, coverage, levels, accuracy, flags, files and inputs; of a stage's
+artifact its contract, attributes and variables with their ranges; of a log (MCAP or PX4 ULog) its
+topics with schemas, rates, span and first values.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from magtiles.catalog.releases.manifest import Manifest
     from magtiles.catalog.releases.reader import Release
 
-HELP = "say what a release or a log holds"
+HELP = "say what a release, an artifact or a log holds"
 NEEDS_PIPELINE = False
 
 _UNCERTAINTIES = {
@@ -30,16 +31,18 @@ _UNCERTAINTIES = {
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``magtiles info``."""
     parser.add_argument(
-        "release", type=Path, metavar="RELEASE", help="folder of a release, or a log file"
+        "release", type=Path, metavar="RELEASE", help="folder of a release, or a file"
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print what the manifest says, once every file is found to be what it lists; or the log."""
+    """Print what the manifest says, once every file is found to be what it lists; or the file."""
     if arguments.release.is_file():
-        from magtiles.pipeline import log_info
+        from magtiles.pipeline import artifact_info, log_info
 
+        if artifact_info.run(arguments.release, as_json=arguments.json):
+            return 0
         return log_info.run(arguments.release, as_json=arguments.json)
     from magtiles.catalog import open_release
 

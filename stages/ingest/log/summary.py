@@ -82,7 +82,9 @@ def summarize_log(path: Path) -> LogSummary:
             f"is a table ({kind}), without topics",
             where=path,
             expected="MCAP or ULog",
-            remedy="look at it with a text editor, and name its columns in a source TOML",
+            remedy="list its datasets with ncdump or h5dump"
+            if kind == "hdf5"
+            else "look at it with a text editor, and name its columns in a source TOML",
         )
     return _SUMMARIES[kind](path)
 
