@@ -143,6 +143,24 @@ def test_the_core_gradient_is_that_of_the_earth(release: Release) -> None:
     assert core.mean(axis=0) == pytest.approx([2.94, 0.89, 22.75], abs=0.01)
 
 
+def test_the_core_gradient_of_colorado(tmp_path: Path) -> None:
+    world = World(lattice=small_lattice(40.0, -105.5), heights=(0.0, 1000.0))
+    an = open_release(world.publish(tmp_path, extra_files=CORE).path).anomaly
+    place = 40.2, -105.2, 500.0
+    _, whole = an.expected_total_with_gradient(*place, "2016-01-15")
+    _, anomaly = an.total_with_gradient(*place)
+    north, _, down = whole - anomaly
+    # 4 to 5 nT/km northward, and some 27 less for each kilometre upward.
+    truth = np.diff(
+        [
+            np.linalg.norm(igrf(40.2, -105.2, h, datetime.datetime(2016, 1, 15)))  # noqa: DTZ001
+            for h in (0.0, 1000.0)
+        ]
+    )
+    assert -down == pytest.approx(truth[0], abs=1e-3)
+    assert (north, -down) == (pytest.approx(4.74, abs=0.01), pytest.approx(-26.52, abs=0.01))
+
+
 def test_nan_where_the_anomaly_is(release: Release) -> None:
     lat = np.array([44.2, np.nan, 10.0, 44.2, 44.37])
     height = np.array([500.0, 500.0, 500.0, 5000.0, 500.0])  # above the highest level; beyond
