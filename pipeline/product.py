@@ -253,6 +253,13 @@ def _model_map(model: ModelTable, product: Path) -> ModelMap:
     if direct.exists() and direct.suffix != ".toml":
         files = tuple(model_files(direct))
         return ModelMap(model, direct, direct.stem, "not stated", None, files, core)
+    if direct.suffix not in ("", ".toml"):
+        raise SourceError(
+            f"coefficient file '{model.coefficients}' does not exist",
+            where=f"{product} model.coefficients",
+            expected=f"a file at {direct}",
+            remedy="correct the path, or name a source TOML, whose files --from can find",
+        )
     path = find_source(model.coefficients, product, "model.coefficients")
     source = load_source(path, FIELD_MODEL)
     header = source.source

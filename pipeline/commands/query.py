@@ -147,6 +147,10 @@ def _ask_model(
 
 
 def _check_dates(dates: Sequence[str], positions: int) -> None:
+    if not dates:
+        raise UsageError(
+            "a model's field changes in time", where="--date", remedy="give --date 2026-07-01"
+        )
     if len(dates) not in (1, positions):
         raise UsageError(
             f"{len(dates)} dates",

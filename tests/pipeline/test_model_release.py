@@ -293,6 +293,11 @@ def test_bad_products(site, capsys, new, said):
         ("[model]", "[anomaly]", "coefficients"),
         ('"coarse-model.toml"', '"elsewhere.toml"', r"model\.coefficients.*elsewhere\.toml"),
         ('"coarse-model.toml"', '"no-such-id"', "catalog has no source 'no-such-id'"),
+        (
+            '"coarse-model.toml"',
+            '"lost.COF"',
+            r"coefficient file 'lost\.COF' does not exist.*--from",
+        ),
         ('"coarse-model.toml"', '"coarse.COF"', r"error of COARSE-24 is not stated"),
     ],
 )

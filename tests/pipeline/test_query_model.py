@@ -66,7 +66,7 @@ def test_several_positions_and_dates(capsys: Capture) -> None:
     [
         (["--model", "igrf14", *PLACE, "--date", "2031-01-01"], 1,
          ["validity of IGRF14; expected 1900 to 2030", "--allow-extrapolated"]),
-        (["--model", "igrf14", *PLACE], 2, ["--date: 0 dates; expected one"]),
+        (["--model", "igrf14", *PLACE], 2, ["--date: a model's field changes", "give --date"]),
         (["--model", "igrf14", *PLACE, "--date", "June"], 1, ["date is 'June'"]),
         (["--model", "igrf12", *PLACE, "--date", "2000"], 1, ["expected 13 or 14"]),
         (["--model", "none.cof", *PLACE, "--date", "2000"], 2, ["no model 'none.cof'"]),
