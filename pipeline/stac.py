@@ -44,7 +44,7 @@ _MEDIA_TYPES = {
     ".png": pystac.MediaType.PNG,
     ".shc": pystac.MediaType.TEXT,
 }
-_ROLES = {"preview": "overview", "temporal": "data", "tile": "data"}
+_ROLES = {"preview": "overview", "temporal": "data", "tile": "data", "road": "data"}
 
 
 def export_stac(folder: Path, out: Path, *, base_url: str | None = None) -> tuple[Path, int]:

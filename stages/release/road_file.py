@@ -27,6 +27,7 @@ from magtiles.stages.release.atomic import atomic_path
 _CHUNK = 65_536
 """Most points of a chunk."""
 _DEFLATE = 4
+_HISTORY = "merged by magtiles from passes of vehicles; how is in provenance.json"
 
 
 def road_path(dataset: xr.Dataset) -> str:
@@ -52,7 +53,8 @@ def write_road(dataset: xr.Dataset, path: Path) -> None:
             )
     with atomic_path(path) as temporary, netCDF4.Dataset(temporary, "w", format="NETCDF4") as file:
         kept = {k: v for k, v in dataset.attrs.items() if k not in ("Conventions", "contract")}
-        _set_attributes(file, {**kept, "Conventions": "CF-1.11", "contract": CONTRACT})
+        told = {"title": f"magnetic map of road {dataset.attrs['road']}", "history": _HISTORY}
+        _set_attributes(file, {**told, **kept, "Conventions": "CF-1.11", "contract": CONTRACT})
         for dimension in (d for d in MOST if d in dataset.sizes):
             file.createDimension(dimension, dataset.sizes[dimension])
         for name in names:
@@ -105,6 +107,8 @@ def _write_variable(file: Any, name: str, array: xr.DataArray) -> None:
     )
     kept = {k: v for k, v in array.attrs.items() if str(k).startswith("flag_")}
     own = {} if rule.units is None else {"units": rule.units}
+    if name in ("latitude", "longitude"):
+        own["standard_name"] = name
     if rule.units == NANOSECONDS:
         own["calendar"] = "proleptic_gregorian"
     _set_attributes(variable, {**kept, "long_name": rule.long_name, **own})

@@ -1,4 +1,4 @@
-"""Tiles and temporal models against CF-1.11, by the IOOS compliance checker.
+"""Tiles, temporal models and road maps against CF-1.11, by the IOOS compliance checker.
 
 The checker depends on an LGPL library, so it is no dependency of ours and stays out of our
 environment: install it in one of its own, and name its program in
@@ -15,10 +15,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from road_maps import Road, road_map
 from temporal import temporal_dataset
 
 from magtiles.pipeline.build import build_product
 from magtiles.pipeline.sample import DEMO, synthesize, write_survey
+from magtiles.stages.release.road_file import write_road
 from magtiles.stages.release.temporal_file import write_temporal
 
 CHECKER = os.environ.get("MAGTILES_COMPLIANCE_CHECKER") or shutil.which("compliance-checker")
@@ -59,3 +61,8 @@ def test_a_temporal_model_keeps_them(tmp_path: Path) -> None:
     write_temporal(temporal_dataset(), tmp_path / "temporal.nc")
     found = complaints(tmp_path / "temporal.nc", tmp_path)
     assert [text for text in found if RECOMMENDED not in text] == []
+
+
+def test_a_road_map_keeps_them(tmp_path: Path) -> None:
+    write_road(road_map(Road("loop", 300.0, 30)), tmp_path / "loop.nc")
+    assert complaints(tmp_path / "loop.nc", tmp_path) == set()
