@@ -33,7 +33,7 @@ LOCKED = {
 # SPDX names, then what packages without an SPDX expression write instead.
 PERMISSIVE = {
     "0BSD", "Apache-2.0", "Apache-2.0 WITH LLVM-exception", "BSD-2-Clause", "BSD-3-Clause",
-    "CC0-1.0", "ISC", "MIT", "MIT-CMU", "PSF-2.0", "Zlib",
+    "CC0-1.0", "ISC", "MIT", "MIT-0", "MIT-CMU", "PSF-2.0", "Zlib",
     "Apache 2.0", "BSD", "New BSD", "BSD 3-Clause License", "3-Clause BSD License", "MIT License",
     "OSI Approved :: Apache Software License", "OSI Approved :: BSD License",
     "OSI Approved :: MIT License", "OSI Approved :: Python Software Foundation License",
