@@ -64,9 +64,12 @@ def parse_model(text: str, file: str) -> FieldModel:
         return read_shc(lines)
     if is_cof(lines):
         return read_cof(lines)
+    page = "<html" in text.lower() or "<!doctype" in text.lower()
     raise FormatError(
-        "is no model of a known format",
+        "is an HTML page" if page else "is no model of a known format",
         where=lines[0].where,
         expected=_FORMATS,
-        remedy="secular variation alone is no model: give the folder of the set",
+        remedy="fetch the file itself"
+        if page
+        else "secular variation alone is no model: give the folder of the set",
     )

@@ -221,6 +221,7 @@ def replaced(text: str, number: int, new: str) -> str:
     [
         Expect("", "bad: is empty", "empty"),
         Expect("some words\n", "bad line 1: is no model of a known format", "foreign"),
+        Expect("<html><p>404</p>\n", "bad line 1: is an HTML page; expected SHC", "page"),
         Expect(SHC[: SHC.rindex("3 -3")], "line 17: degree 3, order -3 is missing", "shc-cut"),
         Expect(SHC[: SHC.rindex("3 -3") + 4], "line 18: 2 columns", "shc-cut-in-line"),
         Expect(without(SHC, 8), "degree 2, order 1 is missing", "shc-order-missing"),

@@ -82,7 +82,7 @@ BAD = [
     Expect("hour", {"f": changed(3, " 00:03", " 24:03")}, FormatError, ("no such time", "24:03")),
     Expect(
         "backwards", {"f": changed(9, "00:09", "00:04")}, FormatError,
-        (f"line {FIRST + 10}", "time goes backwards", "sort"),
+        (f"line {FIRST + 10}", "time goes backwards: 2016-01-01T00:04:00 follows", "sort"),
     ),
     Expect(
         "repeated", {"f": changed(9, "00:09", "00:08")}, FormatError,

@@ -107,9 +107,9 @@ def check_times(time: Times, where: str, lines: NDArray[np.int64]) -> float | No
         return float(steps[0]) / 1e9
     if (steps <= 0).any():
         row = int(np.argmax(steps <= 0)) + 1
-        again = "is repeated" if steps[row - 1] == 0 else f"follows {time[row - 1]}"
+        again = "is repeated" if steps[row - 1] == 0 else f"follows {_shown(time[row - 1])}"
         raise FormatError(
-            f"time goes backwards: {time[row]} {again}",
+            f"time goes backwards: {_shown(time[row])} {again}",
             where=f"{where} line {lines[row]}",
             expected="each row later than the one before",
             remedy="sort the rows, or split the file where the record starts again",
@@ -139,3 +139,7 @@ def _another_cadence(steps: NDArray[np.int64], usual: int) -> NDArray[np.bool_]:
     odd = np.zeros(steps.shape, np.bool_)
     odd[begins[(lengths >= _SAME_SPACING) & (steps[begins] != usual)]] = True
     return odd
+
+
+def _shown(time: np.datetime64) -> str:
+    return str(np.datetime_as_string(time, unit="ms")).removesuffix(".000")
