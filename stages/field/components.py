@@ -6,29 +6,24 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from magtiles.catalog.flags import QualityFlag
 from magtiles.schemas.errors import ContractError, CoverageError, ParameterError
 from magtiles.stages.declare import Params, Stage, quantity
+from magtiles.stages.field.at_nodes import evaluate_products, quality_flags
+from magtiles.stages.field.blocks import Block
 from magtiles.stages.field.direction import Ambient, AmbientSource
-from magtiles.stages.field.interpolate import evaluate_linear, evaluate_spline
-from magtiles.stages.field.level import PRODUCTS, assemble_level, wgs84_variable
+from magtiles.stages.field.large import BLOCK_NODES, LargeLevel, is_large, strips
+from magtiles.stages.field.level import assemble_level, mean_angles, wgs84_variable
 from magtiles.stages.field.padding import plan_padding
-from magtiles.stages.field.prepare import PlaneMap, prepare
+from magtiles.stages.field.prepare import prepare
 from magtiles.stages.field.reuse import content_key, latest
-from magtiles.stages.field.rotation import rotate_to_ned
-from magtiles.stages.field.solve import AnomalousField, solve
-from magtiles.stages.field.spectral import (
-    LOW_INCLINATION_SINE,
-    TENSOR,
-    VECTOR,
-)
+from magtiles.stages.field.solve import solve
 from magtiles.stages.field.surface import surface_at
 from magtiles.stages.field.target import Axis, Nodes, Target, geographic_target, locate, own_target
 from magtiles.stages.field.uncertainty import budget, survey_variance
+from magtiles.stages.field.windows import MapWindows
 
 Single = NDArray[np.float32]
 
-_OVERSAMPLING = 2
 _DROPPED = ("datum_pipeline", "datum_operation", "datum_accuracy_m", "allow_ballpark_datum")
 
 
@@ -57,6 +52,13 @@ class DeriveComponentsParams(Params):
     longitude: Axis | None = quantity(
         "degrees_east", default=None, doc="Output nodes, with latitude: first, spacing, count."
     )
+    block_nodes: int | None = quantity(
+        "1",
+        default=None,
+        ge=128,
+        doc="Transform in blocks of so many nodes a side; default one transform of up to "
+        f"4096 x 4096 nodes, and blocks of {BLOCK_NODES} of larger maps.",
+    )
 
 
 def derive_components(grid: xr.Dataset, *, params: DeriveComponentsParams) -> xr.Dataset:
@@ -73,6 +75,8 @@ def derive_components(grid: xr.Dataset, *, params: DeriveComponentsParams) -> xr
     permission, ParameterError when only one of two angles or axes is given.
     """
     _permit(grid, params)
+    if makes_blocks(grid, params):
+        return _blended(grid, params)
     key = content_key(grid)
     plane_map = latest("plane map", key, lambda: prepare(grid))
     ambient = AmbientSource(grid, params.inclination_deg, params.declination_deg)
@@ -82,7 +86,7 @@ def derive_components(grid: xr.Dataset, *, params: DeriveComponentsParams) -> xr
     if params.latitude is not None and params.longitude is not None:
         target = geographic_target(params.latitude, params.longitude)
     else:
-        target = own_target(grid, plane_map)
+        target = own_target(grid, plane_map.plane)
     axes = params.latitude, params.longitude
     nodes = latest("nodes", (key, angles, axes), lambda: locate(target, plane_map, ambient))
     products = evaluate_products(field, nodes, params.height_m)
@@ -92,41 +96,63 @@ def derive_components(grid: xr.Dataset, *, params: DeriveComponentsParams) -> xr
     return _assemble(grid, target, nodes, params.height_m, products, sigmas, flags)
 
 
-def evaluate_products(field: AnomalousField, nodes: Nodes, height_gain: float) -> Single:
-    """The nine products (9, m, n) in NED at the nodes, in the order of `PRODUCTS`."""
-    out = np.empty((len(PRODUCTS), *nodes.row.shape), np.float32)
-    w, offset = field.wavenumbers, field.padding.offset
-    first = int((nodes.row.min() + offset[0]) * _OVERSAMPLING) - 2
-    last = int((nodes.row.max() + offset[0]) * _OVERSAMPLING) + 4
-    rows = slice(max(first, 0), max(min(last, w.shape[0] * _OVERSAMPLING), 8))
-    shift = np.array([offset[0] * _OVERSAMPLING - rows.start, offset[1] * _OVERSAMPLING], float)
-    level = field.level(height_gain, _OVERSAMPLING)
-    for product, values in zip(("total", *VECTOR, *TENSOR), out, strict=True):
-        coefficients = level.values(product, rows, slice(None))
-        evaluate_spline(coefficients, nodes.row, nodes.column, float(_OVERSAMPLING), shift, values)
-    rotate_to_ned(out, nodes.north, nodes.ambient, np.array(field.inversion.direction))
-    return out
+def makes_blocks(grid: xr.Dataset, params: DeriveComponentsParams) -> bool:
+    """Whether a level is made block by block."""
+    if params.block_nodes is not None:
+        return True
+    shape = grid["magnetic_anomaly"].shape
+    target = [
+        axis[2] if axis is not None else n
+        for axis, n in zip((params.latitude, params.longitude), shape, strict=True)
+    ]
+    return is_large((shape[0], shape[1]), (target[0], target[1]))
 
 
-def quality_flags(plane_map: PlaneMap, nodes: Nodes, height_gain: float) -> NDArray[np.uint8]:
-    """Flags (m, n): gaps grown by the height gained, at least by the cell that reaches them."""
-    cell = max(plane_map.spacing) * (1 - 1e-6)
-    reach = max(abs(height_gain), cell)
-    flags = np.zeros(nodes.row.shape, np.uint8)
-    near = np.empty(nodes.row.shape, np.float32)
-    if plane_map.void.any():
-        distance = plane_map.distance(plane_map.void, outside=False)
-        evaluate_linear(distance, nodes.row, nodes.column, 1.0, 0.0, near)
-        flags[near < reach] |= np.uint8(QualityFlag.VOID_FILLED)
-    distance = plane_map.distance(plane_map.beyond, outside=True)
-    evaluate_linear(np.pad(distance, 1), nodes.row, nodes.column, 1.0, 1.0, near)
-    flags[near < reach] |= np.uint8(QualityFlag.BEYOND_COVERAGE)
-    if height_gain < 0:
-        flags |= np.uint8(QualityFlag.DOWNWARD_CONTINUED)
-    flags[np.abs(nodes.ambient[2]) < LOW_INCLINATION_SINE] |= np.uint8(
-        QualityFlag.REDUCED_ACCURACY_DIRECTION
-    )
-    return flags
+def large_level(
+    grid: xr.Dataset, params: DeriveComponentsParams, whole: xr.Dataset | None = None
+) -> LargeLevel:
+    """The blocks of a level; with `whole`, that level's survey, the map itself is not read.
+
+    Raises as `derive_components`.
+    """
+    _permit(grid, params)
+    known = None if whole is None else (float(whole.attrs["mean"]), float(whole.attrs["sigma"]))
+    windows = MapWindows.of(grid, known)
+    ambient = AmbientSource(grid, params.inclination_deg, params.declination_deg)
+    if params.latitude is not None and params.longitude is not None:
+        target = geographic_target(params.latitude, params.longitude)
+    else:
+        target = own_target(grid, windows.plane)
+    return LargeLevel.plan(windows, ambient, target, params.height_m, params.block_nodes)
+
+
+def derive_block(level: LargeLevel, whole: xr.Dataset, block: Block) -> xr.Dataset:
+    """A block of a level, overlaps included: component-grid/1 on its nodes."""
+    target, nodes, found = level.solve(whole, block)
+    parts = found.products, found.sigmas, found.flags
+    return _assemble(level.windows.grid, target, nodes, level.height_gain, *parts)
+
+
+def _blended(grid: xr.Dataset, params: DeriveComponentsParams) -> xr.Dataset:
+    """A level of blocks, in memory."""
+    level = large_level(grid, params)
+    whole = level.survey()
+    made = {block: derive_block(level, whole, block) for row in level.blocks for block in row}
+    first = made[level.blocks[0][0]]
+    dims, axes = level.target.dims, (level.target.rows, level.target.columns)
+    coordinates = {
+        name: (name, axis, first[name].attrs) for name, axis in zip(dims, axes, strict=True)
+    }
+    out = xr.Dataset(coords=coordinates, attrs=first.attrs)
+    for name, variable in first.data_vars.items():
+        if variable.ndim:
+            values = {block: part[name].values for block, part in made.items()}
+            read = strips(level.blocks, str(name), values.__getitem__)
+            out[name] = dims, np.concatenate([strip for _, strip in read]), variable.attrs
+        else:
+            out[name] = variable
+    means = (float(out[f"ambient_{axis}"].mean(dtype=float)) for axis in ("north", "east", "down"))
+    return out.assign_attrs(mean_angles(*means))
 
 
 def _permit(grid: xr.Dataset, params: DeriveComponentsParams) -> None:

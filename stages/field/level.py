@@ -63,12 +63,17 @@ def assemble_level(
         name: ((name,), values, {"units": unit})
         for name, values, unit in zip(dims, axes, units, strict=True)
     }
-    middle = Ambient(*(np.asarray(part.mean(dtype=float)) for part in ambient))
-    angles = {
+    angles = mean_angles(*(float(part.mean(dtype=float)) for part in ambient))
+    return xr.Dataset(variables, coords=coordinates, attrs={**attributes, **angles})
+
+
+def mean_angles(north: float, east: float, down: float) -> dict[str, float]:
+    """Attributes that say which way the mean ambient vector of a level points."""
+    middle = Ambient(*(np.asarray(part) for part in (north, east, down)))
+    return {
         "ambient_inclination_deg": float(middle.inclination_deg),
         "ambient_declination_deg": float(middle.declination_deg),
     }
-    return xr.Dataset(variables, coords=coordinates, attrs={**attributes, **angles})
 
 
 def wgs84_variable() -> xr.Variable:

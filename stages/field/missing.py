@@ -85,12 +85,13 @@ def thinning_of(shape: tuple[int, int]) -> int:
 def thin_map(plane_map: PlaneMap) -> ThinMap:
     """The thin copy of a map that `missing_data` is measured on."""
     thinning = thinning_of((plane_map.values.shape[0], plane_map.values.shape[1]))
-    parts = (plane_map.values, plane_map.void, plane_map.beyond)
     return ThinMap(
-        *(_thin(part, thinning) for part in parts),
-        thinning,
-        plane_map.spacing,
-        float(np.mean(plane_map.sigma**2)),
+        values=_thin(plane_map.values, thinning),
+        void=_thin(plane_map.void, thinning),
+        beyond=_thin(plane_map.beyond, thinning),
+        thinning=thinning,
+        spacing=plane_map.spacing,
+        noise_variance=float(np.mean(plane_map.sigma**2)),
     )
 
 

@@ -60,13 +60,13 @@ def pad(values: Real, padding: Padding) -> Real:
     widths = list(zip(padding.offset, after, strict=True))
     mean = values.mean()
     padded = np.pad(values - mean, widths, mode="reflect" if min(values.shape) > 1 else "edge")
-    padded *= _taper(values.shape[0], *widths[0])[:, None]
-    padded *= _taper(values.shape[1], *widths[1])
+    padded *= taper(values.shape[0], *widths[0])[:, None]
+    padded *= taper(values.shape[1], *widths[1])
     padded += mean
     return np.asarray(padded)
 
 
-def _taper(length: int, before: int, after: int) -> Real:
+def taper(length: int, before: int, after: int) -> Real:
     """1 over the map, falling as a half cosine to 0 just outside the padded array."""
     rise = 0.5 - 0.5 * np.cos(np.pi * np.arange(1, before + 1) / (before + 1))
     fall = 0.5 + 0.5 * np.cos(np.pi * np.arange(1, after + 1) / (after + 1))

@@ -78,6 +78,11 @@ class Plane:
         x, y = (lon, lat) if self.own is None else self.own(lon, lat)
         return np.asarray(x), np.asarray(y)
 
+    def scale_at(self, y: float, x: float) -> float:
+        """Plane metres to a true metre at one plane position, mean of all directions."""
+        lon, lat = self.projection(*_turned(x, y, self.turn), inverse=True)
+        return _scale(self.projection, np.atleast_1d(lon), np.atleast_1d(lat))[0]
+
     def north(self, latitude: ArrayLike, longitude: ArrayLike) -> tuple[Real, Real]:
         """The (x, y) components of the plane's unit vector toward true north at positions.
 

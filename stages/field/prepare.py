@@ -90,15 +90,16 @@ def prepare(grid: xr.Dataset) -> PlaneMap:
             remedy="run fill-voids first",
         )
     plane = choose_plane(grid)
-    void, beyond = _gaps(grid)
-    sigma = _sigma(grid)
+    void, beyond = gaps_of(grid)
+    sigma = sigma_of(grid)
     if plane.is_source:
         y, x = axes(grid)
         return PlaneMap(plane, y, x, values, void, beyond, sigma)
     return _reproject(grid, plane, void, beyond, sigma)
 
 
-def _gaps(grid: xr.Dataset) -> tuple[Mask, Mask]:
+def gaps_of(grid: xr.Dataset) -> tuple[Mask, Mask]:
+    """Nodes filled inside the survey's outline, and nodes outside it."""
     if "quality_flag" not in grid:
         none = np.zeros(grid["magnetic_anomaly"].shape, dtype=bool)
         return none, none
@@ -106,17 +107,19 @@ def _gaps(grid: xr.Dataset) -> tuple[Mask, Mask]:
     return (flags & QualityFlag.VOID_FILLED) > 0, (flags & QualityFlag.BEYOND_COVERAGE) > 0
 
 
-def _sigma(grid: xr.Dataset) -> Real:
-    """The survey's own sigma; where a gridded one is void, its median."""
+def sigma_of(grid: xr.Dataset, otherwise: float | None = None) -> Real:
+    """The survey's own sigma; where a gridded one is void, its median or what is given."""
     sigma = np.asarray(grid["magnetic_anomaly_uncertainty"].values, dtype=float)
-    if not np.isfinite(sigma).any():
+    if otherwise is None and not np.isfinite(sigma).any():
         raise ContractError(
             "no finite value",
             where="magnetic_anomaly_uncertainty",
             expected="sigma in nT > 0",
             remedy="set uncertainty_nt in the source's TOML",
         )
-    return np.where(np.isfinite(sigma), sigma, np.nanmedian(sigma))
+    if otherwise is None:
+        otherwise = float(np.nanmedian(sigma))
+    return np.where(np.isfinite(sigma), sigma, otherwise)
 
 
 def _reproject(grid: xr.Dataset, plane: Plane, void: Mask, beyond: Mask, sigma: Real) -> PlaneMap:
@@ -125,26 +128,25 @@ def _reproject(grid: xr.Dataset, plane: Plane, void: Mask, beyond: Mask, sigma: 
     A cubic spline through the samples themselves would cost 0.3 %; through samples twice as
     dense it costs less than the transform's own error.
     """
-    y, x = _plane_axes(grid, plane)
+    y, x = plane_axes(grid, plane)
     row, column = on_lattice(lambda yy, xx: index_of(grid, *plane.to_source(xx, yy)), y, x, STEP_M)
-    values = _resample(grid["magnetic_anomaly"].values.astype(float), row, column)
+    values = resample(grid["magnetic_anomaly"].values.astype(float), row, column)
+    return PlaneMap(plane, y, x, values, *nearest_node(void, beyond, sigma, row, column))
+
+
+def nearest_node(
+    void: Mask, beyond: Mask, sigma: Real, row: Real, column: Real
+) -> tuple[Mask, Mask, Real]:
+    """`void`, `beyond` and `sigma` of the nodes nearest to a place; beyond where there are none."""
     nearest = [np.rint(row), np.rint(column)]
     inside = np.ones(row.shape, dtype=bool)
     for index, size in zip(nearest, void.shape, strict=True):
         inside &= (index >= 0) & (index <= size - 1)
     at = tuple(np.clip(i, 0, n - 1).astype(int) for i, n in zip(nearest, void.shape, strict=True))
-    return PlaneMap(
-        plane,
-        y,
-        x,
-        values,
-        void=void[at] & inside,
-        beyond=beyond[at] | ~inside,
-        sigma=sigma[at] if sigma.ndim else sigma,
-    )
+    return void[at] & inside, beyond[at] | ~inside, sigma[at] if sigma.ndim else sigma
 
 
-def _plane_axes(grid: xr.Dataset, plane: Plane) -> tuple[Real, Real]:
+def plane_axes(grid: xr.Dataset, plane: Plane) -> tuple[Real, Real]:
     """Coordinates of a lattice that covers the grid's outline, at the grid's own density."""
     rows, columns = axes(grid)
     v = np.linspace(rows[0], rows[-1], _EDGE_PROBES)
@@ -161,7 +163,8 @@ def _plane_axes(grid: xr.Dataset, plane: Plane) -> tuple[Real, Real]:
     return axis[0], axis[1]
 
 
-def _resample(values: Real, row: Real, column: Real) -> Real:
+def resample(values: Real, row: Real, column: Real) -> Real:
+    """Values at fractional rows and columns, by Fourier oversampling and a cubic spline."""
     padding = plan_padding((values.shape[0], values.shape[1]), (1.0, 1.0), 0.0)
     inversion = Inversion(Wavenumbers(padding.shape, (1.0, 1.0)), (0.0, 0.0, 1.0))
     total = forward(pad(values, padding))

@@ -78,25 +78,35 @@ def plane_direction(plane: Plane, ambient: AmbientSource) -> Callable[[Real, Rea
 def solve(plane_map: PlaneMap, ambient: AmbientSource, padding: Padding) -> AnomalousField:
     """The anomalous field of a map, ready to be continued as far as `padding` was planned for."""
     wavenumbers = Wavenumbers(padding.shape, plane_map.spacing)
-    directions = _coarse_directions(plane_map, ambient)
-    mean = np.array([part.mean() for part in directions])
-    mean /= np.linalg.norm(mean)
-    inversion = Inversion(wavenumbers, (float(mean[0]), float(mean[1]), float(mean[2])))
+    directions = coarse_directions(plane_map.plane, plane_map.y, plane_map.x, ambient)
+    mean, variation = split_direction(directions)
+    inversion = Inversion(wavenumbers, mean)
     padded = pad(plane_map.values, padding)
-    variation = [part - m for part, m in zip(directions, mean, strict=True)]
     total = follow(padded, inversion, variation, padding.offset, padding.map_shape)
-    signal, noise = float(plane_map.values.var()), float(np.mean(plane_map.sigma**2))
-    noise_to_signal = noise / signal if noise < signal else 1.0
-    return AnomalousField(padding, wavenumbers, inversion, total, noise_to_signal)
+    ratio = noise_to_signal(float(np.mean(plane_map.sigma**2)), float(plane_map.values.var()))
+    return AnomalousField(padding, wavenumbers, inversion, total, ratio)
 
 
-def _coarse_directions(plane_map: PlaneMap, ambient: AmbientSource) -> Direction:
-    """Ambient unit vector (y, x, d) at points some 25 km apart, from corner to corner of the map.
+def noise_to_signal(noise: float, signal: float) -> float:
+    """Ratio of two variances, at most 1."""
+    return noise / signal if noise < signal else 1.0
+
+
+def coarse_directions(plane: Plane, y: Real, x: Real, ambient: AmbientSource) -> Direction:
+    """Ambient unit vector (y, x, d) at points some 25 km apart, from corner to corner of a map.
 
     Between them it is linear within 1e-5.
     """
-    y, x = (coarse_axis(axis, STEP_M) for axis in (plane_map.y, plane_map.x))
-    return plane_direction(plane_map.plane, ambient)(*np.meshgrid(y, x, indexing="ij"))
+    nodes = (coarse_axis(axis, STEP_M) for axis in (y, x))
+    return plane_direction(plane, ambient)(*np.meshgrid(*nodes, indexing="ij"))
+
+
+def split_direction(directions: Direction) -> tuple[tuple[float, float, float], list[Real]]:
+    """The unit vector of their mean, and what each part differs from it."""
+    mean = np.array([part.mean() for part in directions])
+    mean /= np.linalg.norm(mean)
+    variation = [part - m for part, m in zip(directions, mean, strict=True)]
+    return (float(mean[0]), float(mean[1]), float(mean[2])), variation
 
 
 def follow(

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from magtiles.stages.field.direction import AmbientSource
 from magtiles.stages.field.geometry import axes, is_geographic
-from magtiles.stages.field.plane import STEP_DEG, STEP_M, on_lattice
+from magtiles.stages.field.plane import STEP_DEG, STEP_M, Plane, on_lattice
 from magtiles.stages.field.prepare import PlaneMap
+from magtiles.stages.field.windows import MapWindows
 
 Real = NDArray[np.float64]
 Single = NDArray[np.float32]
@@ -38,6 +39,11 @@ class Target:
     geographic: Callable[[Real, Real], tuple[Real, Real]]
     step: float
 
+    def part(self, rows: tuple[int, int], columns: tuple[int, int]) -> Target:
+        """Some of its rows and columns, from a first to before a last."""
+        some = self.rows[slice(*rows)], self.columns[slice(*columns)]
+        return Target(self.dims, *some, self.geographic, self.step)
+
 
 @dataclass(frozen=True)
 class Nodes:
@@ -59,20 +65,20 @@ def geographic_target(latitude: Axis, longitude: Axis) -> Target:
     return Target(("latitude", "longitude"), rows, columns, lambda lat, lon: (lat, lon), STEP_DEG)
 
 
-def own_target(grid: xr.Dataset, plane_map: PlaneMap) -> Target:
+def own_target(grid: xr.Dataset, plane: Plane) -> Target:
     """The grid's own nodes."""
     rows, columns = axes(grid)
     first, second = (str(d) for d in grid["magnetic_anomaly"].dims)
 
     def geographic(row: Real, column: Real) -> tuple[Real, Real]:
-        lon, lat = plane_map.plane.source.transform(column, row)
+        lon, lat = plane.source.transform(column, row)
         return np.asarray(lat), np.asarray(lon)
 
     step = STEP_DEG if is_geographic(grid) else STEP_M
     return Target((first, second), rows, columns, geographic, step)
 
 
-def locate(target: Target, plane_map: PlaneMap, ambient: AmbientSource) -> Nodes:
+def locate(target: Target, plane_map: PlaneMap | MapWindows, ambient: AmbientSource) -> Nodes:
     """Where each node of a target lies on the plane, and the directions there."""
     plane, (step_y, step_x) = plane_map.plane, plane_map.step
 

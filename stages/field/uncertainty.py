@@ -89,9 +89,16 @@ def survey_variance(plane_map: PlaneMap, row: Real, column: Real) -> Real:
 
 def noise_gain(field: AnomalousField, height_gain: float) -> dict[str, float]:
     """Variance of each group per unit variance of white noise on the map's nodes (Parseval)."""
-    w = field.wavenumbers
-    lift = w.continuation(height_gain, field.noise_to_signal) ** 2
-    return group_means(field.inversion, lift)
+    return noise_gain_of(field.inversion, height_gain, field.noise_to_signal)
+
+
+def noise_gain_of(
+    inversion: Inversion, height_gain: float, noise_to_signal: float
+) -> dict[str, float]:
+    """`noise_gain` of a transform that is not at hand."""
+    return group_means(
+        inversion, inversion.wavenumbers.continuation(height_gain, noise_to_signal) ** 2
+    )
 
 
 def faded_power(

@@ -1,0 +1,150 @@
+"""One level of a map that is too large for one transform, or for memory, block by block."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from magtiles.stages.field.blocks import (
+    OVERLAP_CELLS,
+    Block,
+    BlockSolution,
+    plan_blocks,
+    solve_block,
+)
+from magtiles.stages.field.direction import AmbientSource
+from magtiles.stages.field.level import PRODUCTS
+from magtiles.stages.field.target import Nodes, Target, locate
+from magtiles.stages.field.whole import survey_whole
+from magtiles.stages.field.windows import MapWindows, Span
+
+Real = NDArray[np.float64]
+
+LARGEST = 4096 * 4096
+"""Nodes of a map that is still transformed at once, and half those of a level made at once."""
+BLOCK_NODES = 2048
+_METRES_PER_DEGREE = 111_195.0
+
+
+def is_large(shape: tuple[int, int], target: tuple[int, int]) -> bool:
+    """Whether a map of that shape is made block by block for a target of that shape."""
+    return shape[0] * shape[1] > LARGEST or target[0] * target[1] > 2 * LARGEST
+
+
+@dataclass(frozen=True)
+class LargeLevel:
+    """A level to be made block by block.
+
+    Attributes
+    ----------
+    windows, ambient : the map and its ambient direction.
+    target : the nodes of the level.
+    height_gain : of the level above the map, m.
+    blocks : rows of blocks.
+    """
+
+    windows: MapWindows
+    ambient: AmbientSource
+    target: Target
+    height_gain: float
+    blocks: list[list[Block]]
+
+    @classmethod
+    def plan(
+        cls,
+        windows: MapWindows,
+        ambient: AmbientSource,
+        target: Target,
+        height_gain: float,
+        block_nodes: int | None,
+    ) -> LargeLevel:
+        """Blocks of at most `block_nodes` nodes of the map a side, and of the target as well."""
+        wide = block_nodes or BLOCK_NODES
+        ratio = [max(windows.spacing) / d for d in _spacing(target)]
+        most, overlap = (
+            (int(wide * min(r, 1.0)) for r in ratio),
+            (int(np.ceil(OVERLAP_CELLS * r)) for r in ratio),
+        )
+        shape = target.rows.size, target.columns.size
+        blocks = plan_blocks(shape, tuple(most), tuple(overlap))
+        return cls(windows, ambient, target, height_gain, blocks)
+
+    def survey(self) -> xr.Dataset:
+        """What every block needs to know of the whole map."""
+        return survey_whole(self.windows, self.ambient, self.height_gain)
+
+    def solve(self, whole: xr.Dataset, block: Block) -> tuple[Target, Nodes, BlockSolution]:
+        """A block's nodes, overlaps included, and what the level is there."""
+        part = self.target.part(block.outer_rows, block.outer_columns)
+        nodes = locate(part, self.windows, self.ambient)
+        return part, nodes, solve_block(self.windows, whole, self.ambient, nodes, self.height_gain)
+
+
+def strips(
+    blocks: list[list[Block]], name: str, read: Callable[[Block], NDArray[Any]]
+) -> Iterator[tuple[Span, NDArray[Any]]]:
+    """A variable of a level, in strips of rows from south to north, from that of its blocks.
+
+    `read` gives a block's values on its outer nodes. Products are blended where blocks overlap;
+    all else, which no transform makes, is the block's that owns the node.
+    """
+    width = blocks[0][-1].columns[1]
+    below = None
+    for row, above in itertools.zip_longest(blocks, blocks[1:]):
+        first, last = row[0].outer_rows if name in PRODUCTS else row[0].rows
+        strip: NDArray[Any] | None = None
+        for block in row:
+            part, columns = _part(block, name, read(block))
+            if strip is None:
+                strip = np.zeros((last - first, width), part.dtype)
+            strip[:, slice(*columns)] += part
+        assert strip is not None
+        if below is not None:
+            strip[: below.shape[0]] += below
+        end = last if above is None or name not in PRODUCTS else above[0].outer_rows[0]
+        yield (first, end), strip[: end - first]
+        below = strip[end - first :]
+
+
+def _part(block: Block, name: str, values: NDArray[Any]) -> tuple[NDArray[Any], Span]:
+    """What a block adds to a strip, and to which of its columns."""
+    outer = block.outer_rows, block.outer_columns
+    own = block.rows, block.columns
+    if name in PRODUCTS:
+        weights = np.multiply.outer(*(_ramp(o, e) for o, e in zip(own, outer, strict=True)))
+        return (values * weights).astype(values.dtype), block.outer_columns
+    rows, columns = (slice(o[0] - e[0], o[1] - e[0]) for o, e in zip(own, outer, strict=True))
+    return values[rows, columns], block.columns
+
+
+def _ramp(own: Span, outer: Span) -> Real:
+    """By how much a block counts along one axis of its outer nodes; all blocks sum to 1."""
+    places = np.arange(*outer) + 0.5
+    weight = np.ones(places.size)
+    if outer[0] < own[0]:
+        reach = own[0] - outer[0]
+        weight *= _rise((places - own[0]) / reach)
+    if outer[1] > own[1]:
+        reach = outer[1] - own[1]
+        weight *= 1.0 - _rise((places - own[1]) / reach)
+    return weight
+
+
+def _rise(t: Real) -> Real:
+    """From 0 at -1 to 1 at 1, as half a cosine."""
+    return np.asarray(0.5 + 0.5 * np.sin(np.pi / 2 * np.clip(t, -1.0, 1.0)))
+
+
+def _spacing(target: Target) -> tuple[float, float]:
+    """Mean node spacing of a target along its rows and columns, metres."""
+    down, across = (float(a[-1] - a[0]) / max(a.size - 1, 1) for a in (target.rows, target.columns))
+    if target.dims[0] == "y":
+        return down, across
+    middle = np.radians((target.rows[0] + target.rows[-1]) / 2)
+    return _METRES_PER_DEGREE * down, _METRES_PER_DEGREE * across * float(np.cos(middle))
