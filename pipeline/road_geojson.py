@@ -32,7 +32,7 @@ def export_geojson(folder: Path, out: Path) -> list[tuple[Path, int]]:
     whole release, UsageError where `out` exists or the release has no roads.
     """
     release = open_release(folder)
-    if not release.roads:
+    if not release.manifest.roads:
         raise UsageError(
             "the release has no roads", where=folder, expected="one built with [[roads]]"
         )

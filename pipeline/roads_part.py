@@ -145,8 +145,10 @@ def _maps(roads: RoadSources, tracks: _Tracks) -> Iterator[Path]:
                 for drive in drives
             ]
             stem = f"{road.name}-{way}"
-            merged = tracks.run(merge.STAGE, {"passes": passes}, f"{stem}-merged", {})
-            yield tracks.run(features.STAGE, {"road": merged}, f"{stem}-features", {})
+            whole = passes[0]
+            if len(passes) > 1:
+                whole = tracks.run(merge.STAGE, {"passes": passes}, f"{stem}-merged", {})
+            yield tracks.run(features.STAGE, {"road": whole}, f"{stem}-features", {})
 
 
 def _pass(

@@ -127,7 +127,7 @@ def write_drives(folder: Path, roads: Iterable[Road] = ROADS) -> list[Path]:
         truth = road.truth(REFERENCE.above_m)
         paths.append(_write_netcdf(folder / f"{road.route.name}-truth.nc", truth))
         for vehicle, number in passes(road):
-            paths += _write_drive(folder, road, vehicle, number)
+            paths += write_drive(folder, road, vehicle, number)
     return paths
 
 
@@ -187,7 +187,8 @@ def vehicles_truth() -> xr.Dataset:
     return xr.Dataset(variables, coords, {"title": "true calibrations of the sample vehicles"})
 
 
-def _write_drive(folder: Path, road: Road, vehicle: Vehicle, number: int) -> list[Path]:
+def write_drive(folder: Path, road: Road, vehicle: Vehicle, number: int) -> list[Path]:
+    """Write one drive: its log, source TOML and truth."""
     stem = f"{vehicle.name}-{road.route.name}-{number}"
     made = record(road, vehicle, number, start_of(road, vehicle, number))
     log, toml = folder / f"{stem}.mcap", folder / f"{stem}.toml"

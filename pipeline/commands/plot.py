@@ -92,9 +92,17 @@ def _road_figure(folder: Path, name: str, quantity: str) -> Figure:
     from magtiles.catalog import open_release
     from magtiles.pipeline.artifacts import open_artifact
     from magtiles.pipeline.road_plots import road_figure
+    from magtiles.schemas.errors import UsageError
 
     release = open_release(folder)
-    _ = release.roads[name]  # verifies the file
+    if name not in release.manifest.roads:
+        known = ", ".join(sorted(release.manifest.roads))
+        raise UsageError(
+            f"the release has no road '{name}'",
+            where="--road",
+            expected=f"one of {known}" if known else "a release with [[roads]]",
+        )
+    release.roads[name]  # verifies the file, which is then drawn with all that it holds
     with open_artifact(folder / release.manifest.roads[name].path) as road:
         return road_figure(road, quantity)
 

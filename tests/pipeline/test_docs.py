@@ -23,6 +23,7 @@ from magtiles.pipeline.product import (
     ProductTables,
     RegionTable,
 )
+from magtiles.pipeline.road_sources import RoadsTable
 from magtiles.pipeline.sample import DEMO, synthesize, write_survey
 from magtiles.pipeline.synthetic_observatories import TemporalSample
 from magtiles.pipeline.temporal_part import TemporalTable
@@ -55,6 +56,7 @@ TABLES = {
     "[log.columns]": Columns,
     "[model]": ModelTable,
     "[temporal]": TemporalTable,
+    "[[roads]]": RoadsTable,
     "region": RegionTable,
 }
 KINDS: dict[str, SourceKind[Any]] = {

@@ -76,8 +76,8 @@ class Truth:
 
     road: Road
 
-    def at(self, road_map: xr.Dataset) -> Floats:
-        """At the places (point,) that a map states, nT (point, 3)."""
+    def at(self, latitude: Floats, longitude: Floats, direction: str) -> Floats:
+        """At the places (point,) of a map driven in a direction, nT (point, 3)."""
         lane = self.road.lane
         route = self.road.route
         plane = pyproj.Transformer.from_crs(
@@ -88,11 +88,11 @@ class Truth:
             ),
             always_xy=True,
         )  # fmt: skip
-        east, north = plane.transform(road_map["longitude"].values, road_map["latitude"].values)
+        east, north = plane.transform(longitude, latitude)
         place = np.column_stack([north, east])
         step = np.gradient(place, axis=0)
         course = np.arctan2(step[:, 1], step[:, 0])
-        if road_map.attrs["direction"] == "backward":
+        if direction == "backward":
             course += np.pi
         along = np.arange(0.0, lane.distance[-1], _STEPS_M)
         lane_north, lane_east, heading = lane.at(along)
@@ -141,7 +141,9 @@ def closeness(name: str, roads: Path) -> Closeness:
     def errors(road_map: xr.Dataset) -> tuple[Floats, NDArray[np.bool_]]:
         number = np.rint(road_map["distance"].values / road_map.attrs["spacing_m"]).astype(int)
         kept = np.isin(number, list(shared))
-        return (road_map["field_body"].values - truth.at(road_map))[kept], kept
+        where = (road_map[name].values for name in ("latitude", "longitude"))
+        true = truth.at(*where, road_map.attrs["direction"])
+        return (road_map["field_body"].values - true)[kept], kept
 
     error, kept = errors(merged)
     return Closeness(
