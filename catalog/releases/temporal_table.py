@@ -6,22 +6,19 @@ missing, as days since then with NaN (`quiet_day`); missing values of floats are
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from magtiles.catalog.releases.record_file import DAYS, SECONDS, RecordTable, RecordVariable
 
 CONTRACT = "temporal-model/1.0.0"
 PATH = "temporal.nc"
 
 ELEMENTS = ("north", "east", "down", "total")
 
-SECONDS = "seconds since 1970-01-01"
-DAYS = "days since 1970-01-01"
-
 _FLOATS = ("float32", "float64")
 _OF_MINUTE = ("observatory", "element", "month", "minute")
 _OF_SEGMENT = ("observatory", "element", "segment")
 _OF_CLASS = ("observatory", "element", "class")
 
-MOST = {
+_MOST = {
     "observatory": 1000,
     "element": len(ELEMENTS),
     "month": 10_000,
@@ -34,57 +31,47 @@ MOST = {
 """Largest size of each dimension."""
 
 
-@dataclass(frozen=True)
-class TemporalVariable:
-    """Dimensions, dtypes as stored ("str": text), unit (None: has none) and description."""
-
-    dims: tuple[str, ...]
-    dtypes: tuple[str, ...]
-    units: str | None
-    long_name: str
+def _place(units: str, long_name: str) -> RecordVariable:
+    return RecordVariable(("observatory",), ("float64",), units, long_name)
 
 
-def _place(units: str, long_name: str) -> TemporalVariable:
-    return TemporalVariable(("observatory",), ("float64",), units, long_name)
+def _fitted(dims: tuple[str, ...], units: str, long_name: str) -> RecordVariable:
+    return RecordVariable(dims, _FLOATS, units, long_name)
 
 
-def _fitted(dims: tuple[str, ...], units: str, long_name: str) -> TemporalVariable:
-    return TemporalVariable(dims, _FLOATS, units, long_name)
+def _code(long_name: str) -> RecordVariable:
+    return RecordVariable(("class",), ("int8",), None, long_name)
 
 
-def _code(long_name: str) -> TemporalVariable:
-    return TemporalVariable(("class",), ("int8",), None, long_name)
-
-
-TEMPORAL_VARIABLES: dict[str, TemporalVariable] = {
-    "iaga_code": TemporalVariable(("observatory",), ("str",), None, "IAGA code"),
+TEMPORAL_VARIABLES: dict[str, RecordVariable] = {
+    "iaga_code": RecordVariable(("observatory",), ("str",), None, "IAGA code"),
     "latitude": _place("degrees_north", "geodetic latitude"),
     "longitude": _place("degrees_east", "geodetic longitude"),
     "elevation": _place("m", "height above mean sea level"),
     "dip_latitude": _place("degree", "dip latitude, atan(tan(inclination) / 2)"),
-    "element": TemporalVariable(("element",), ("str",), None, "element of the field"),
-    "month": TemporalVariable(("month",), ("int64",), SECONDS, "start of the month"),
-    "minute": TemporalVariable(("minute",), _FLOATS, "min", "local mean solar time"),
+    "element": RecordVariable(("element",), ("str",), None, "element of the field"),
+    "month": RecordVariable(("month",), ("int64",), SECONDS, "start of the month"),
+    "minute": RecordVariable(("minute",), _FLOATS, "min", "local mean solar time"),
     "baseline": _fitted(_OF_MINUTE, "nT", "quiet-day variation from local midnight"),
     "baseline_standard_error": _fitted(_OF_MINUTE, "nT", "standard error of the baseline"),
     "level": _fitted(
         ("observatory", "element", "month"), "nT", "local-midnight level of the quiet days"
     ),
-    "quiet_day": TemporalVariable(
+    "quiet_day": RecordVariable(
         ("observatory", "month", "rank"), ("float64",), DAYS, "quiet days that were averaged"
     ),
-    "quiet_day_choice": TemporalVariable(
+    "quiet_day_choice": RecordVariable(
         ("observatory", "month"), ("uint8",), None, "how the quiet days were chosen"
     ),
-    "segment_start": TemporalVariable(("segment",), ("int64",), SECONDS, "start of the segment"),
-    "kp": TemporalVariable(("segment",), _FLOATS, "1", "Kp of the segment"),
+    "segment_start": RecordVariable(("segment",), ("int64",), SECONDS, "start of the segment"),
+    "kp": RecordVariable(("segment",), _FLOATS, "1", "Kp of the segment"),
     "sigma": _fitted(_OF_SEGMENT, "nT", "FOGM standard deviation, maximum likelihood about zero"),
     "sigma_low": _fitted(_OF_SEGMENT, "nT", "lower profile-likelihood bound of sigma"),
     "sigma_high": _fitted(_OF_SEGMENT, "nT", "upper profile-likelihood bound of sigma"),
     "tau": _fitted(_OF_SEGMENT, "s", "FOGM time constant, maximum likelihood about zero"),
     "tau_low": _fitted(_OF_SEGMENT, "s", "lower profile-likelihood bound of tau"),
     "tau_high": _fitted(_OF_SEGMENT, "s", "upper profile-likelihood bound of tau"),
-    "tau_unidentified": TemporalVariable(
+    "tau_unidentified": RecordVariable(
         _OF_SEGMENT, ("uint8",), None, "1 where the segment does not bound tau"
     ),
     "sigma_autocorrelation": _fitted(_OF_SEGMENT, "nT", "sigma of the autocorrelation's fit"),
@@ -92,7 +79,7 @@ TEMPORAL_VARIABLES: dict[str, TemporalVariable] = {
     "sigma_about_mean": _fitted(_OF_SEGMENT, "nT", "sigma about the segment's mean"),
     "tau_about_mean": _fitted(_OF_SEGMENT, "s", "tau about the segment's mean"),
     "valid_fraction": _fitted(_OF_SEGMENT, "1", "share of the segment's samples that are there"),
-    "predicted": TemporalVariable(("predicted",), ("str",), None, "what persistence is of"),
+    "predicted": RecordVariable(("predicted",), ("str",), None, "what persistence is of"),
     "persistence": _fitted(
         ("observatory", "element", "predicted"),
         "1",
@@ -101,14 +88,14 @@ TEMPORAL_VARIABLES: dict[str, TemporalVariable] = {
     "class_kp": _code("activity: 0 quiet, 1 stormy (Kp >= 3), -1 any"),
     "class_season": _code("season of the hemisphere: 0 winter, 1 equinox, 2 summer, -1 any"),
     "class_local_time": _code("quarter of the local day from midnight: 0 to 3, -1 any"),
-    "class_segments": TemporalVariable(_OF_CLASS, ("int32",), None, "segments pooled"),
+    "class_segments": RecordVariable(_OF_CLASS, ("int32",), None, "segments pooled"),
     "class_sigma": _fitted(_OF_CLASS, "nT", "pooled FOGM standard deviation"),
     "class_sigma_low": _fitted(_OF_CLASS, "nT", "lower bound of the pooled sigma"),
     "class_sigma_high": _fitted(_OF_CLASS, "nT", "upper bound of the pooled sigma"),
     "class_tau": _fitted(_OF_CLASS, "s", "pooled FOGM time constant"),
     "class_tau_low": _fitted(_OF_CLASS, "s", "lower bound of the pooled tau"),
     "class_tau_high": _fitted(_OF_CLASS, "s", "upper bound of the pooled tau"),
-    "class_tau_unidentified": TemporalVariable(
+    "class_tau_unidentified": RecordVariable(
         _OF_CLASS, ("uint8",), None, "1 where the pooled segments do not bound tau"
     ),
 }
@@ -125,3 +112,5 @@ FOGM = (
     "class_kp", "class_season", "class_local_time", "class_segments", "class_sigma", "class_tau",
 )  # fmt: skip
 """Variables that stand together: those of baselines, those of Gauss-Markov statistics, or both."""
+
+TABLE = RecordTable("temporal model", "temporal.nc", CONTRACT, TEMPORAL_VARIABLES, _MOST, 1 << 30)

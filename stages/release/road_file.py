@@ -2,31 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import netCDF4
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from magtiles.catalog.releases.digest import array_digest, sha256
 from magtiles.catalog.releases.road_file import RoadData, read_road
-from magtiles.catalog.releases.road_table import (
-    CONTRACT,
-    MOST,
-    NANOSECONDS,
-    ROAD_VARIABLES,
-    RoadVariable,
-    road_name,
-)
-from magtiles.schemas import contracts
-from magtiles.schemas.errors import ContractError
-from magtiles.stages.release.atomic import atomic_path
+from magtiles.catalog.releases.road_table import CONTRACT, TABLE, road_name
+from magtiles.stages.release.record_file import write_record
 
 _CHUNK = 65_536
 """Most points of a chunk."""
-_DEFLATE = 4
 _HISTORY = "merged by magtiles from passes of vehicles; how is in provenance.json"
 
 
@@ -42,23 +31,8 @@ def write_road(dataset: xr.Dataset, path: Path) -> None:
     Raises ContractError for a dataset that is none, or with variables that a release has no
     place for.
     """
-    contracts.check(dataset, CONTRACT, where=path)
-    names = sorted(map(str, dataset.variables))
-    for name in names:
-        if name not in ROAD_VARIABLES:
-            raise ContractError(
-                f"variable {name} has no place in a release",
-                where=path,
-                expected=f"only variables of {CONTRACT}",
-            )
-    with atomic_path(path) as temporary, netCDF4.Dataset(temporary, "w", format="NETCDF4") as file:
-        kept = {k: v for k, v in dataset.attrs.items() if k not in ("Conventions", "contract")}
-        told = {"title": f"magnetic map of road {dataset.attrs['road']}", "history": _HISTORY}
-        _set_attributes(file, {**told, **kept, "Conventions": "CF-1.11", "contract": CONTRACT})
-        for dimension in (d for d in MOST if d in dataset.sizes):
-            file.createDimension(dimension, dataset.sizes[dimension])
-        for name in names:
-            _write_variable(file, name, dataset[name])
+    told = {"title": f"magnetic map of road {dataset.attrs.get('road')}", "history": _HISTORY}
+    write_record(dataset, path, TABLE, told, _chunks)
 
 
 def measure_road(path: Path, place: str) -> dict[str, Any]:
@@ -93,37 +67,5 @@ def _bounds(road: RoadData) -> dict[str, list[float]]:
     }
 
 
-def _write_variable(file: Any, name: str, array: xr.DataArray) -> None:
-    rule, sizes = ROAD_VARIABLES[name], array.sizes
-    text = rule.dtypes == ("str",)
-    chunks = [min(sizes[d], _CHUNK) if d != "vehicle" else 1 for d in rule.dims]
-    packing: dict[str, Any] = {} if text else {
-        "compression": "zlib", "complevel": _DEFLATE, "shuffle": True, "fletcher32": True,
-    }  # fmt: skip
-    values = _stored(rule, array.transpose(*rule.dims).values)
-    dtype = str if text else values.dtype
-    variable = file.createVariable(
-        name, dtype, rule.dims, fill_value=None if text else False, chunksizes=chunks, **packing
-    )
-    kept = {k: v for k, v in array.attrs.items() if str(k).startswith("flag_")}
-    own = {} if rule.units is None else {"units": rule.units}
-    if name in ("latitude", "longitude"):
-        own["standard_name"] = name
-    if rule.units == NANOSECONDS:
-        own["calendar"] = "proleptic_gregorian"
-    _set_attributes(variable, {**kept, "long_name": rule.long_name, **own})
-    variable[...] = values.astype(object) if text else values
-
-
-def _stored(rule: RoadVariable, values: NDArray[Any]) -> NDArray[Any]:
-    """Values as the file has them: times counted, text as str."""
-    if rule.dtypes == ("str",):
-        return values.astype(str)
-    if rule.units == NANOSECONDS:
-        return values.astype("datetime64[ns]").astype(np.int64)
-    return values
-
-
-def _set_attributes(target: Any, attributes: dict[Any, Any]) -> None:
-    for key in sorted(attributes, key=str):
-        target.setncattr(str(key), attributes[key])
+def _chunks(dims: tuple[str, ...], sizes: Mapping[Any, int]) -> list[int]:
+    return [min(sizes[d], _CHUNK) if d != "vehicle" else 1 for d in dims]
