@@ -21,7 +21,9 @@ from scipy.spatial.transform import Rotation
 
 from magtiles.catalog.kernels.geodesy import metres_per_degree
 from magtiles.pipeline.artifacts import write_artifact
+from magtiles.pipeline.sample_observatories import write_record
 from magtiles.pipeline.synthetic import Sample, core_field
+from magtiles.pipeline.synthetic_observatories import StationSpec
 from magtiles.stages.release.atomic import atomic_path
 from magtiles.stages.vehicle.tolles_lawson.terms import AXES, EDDY, INDUCED, PERMANENT, term_units
 
@@ -42,6 +44,7 @@ title = "Synthetic flight with exact truth beside it"
 units = "nT"
 height_reference = "ellipsoid"
 sensor_to_body = "forward,right,down"
+column_units = {{speed_m_s = "m s-1"}}
 
 [log.columns]
 time = "time_utc"
@@ -52,7 +55,17 @@ field_z = "flux_z_nt"
 latitude = "latitude_deg"
 longitude = "longitude_deg"
 height = "height_m"
+speed = "speed_m_s"
+line = "line"
 """
+
+_BASE = StationSpec(
+    code="XBS", name="Synthetic base station", latitude=46.0, longitude=-121.5,
+    elevation_m=100.0, reported="XYZF", crust_nt=(0.0, 0.0, 0.0), sq=((), (), ()),
+    storm=(0.0, 0.0, 0.0), sigma_nt=((0.0,) * 3, (0.0,) * 3), tau_s=((0.0,) * 3, (0.0,) * 3),
+    gaps=(),
+)  # fmt: skip
+"""Of the flight's day; it reads the core field and the variation, by the minute."""
 
 
 @dataclass(frozen=True)
@@ -142,14 +155,47 @@ def fly(sample: Sample, aircraft: Aircraft = AIRCRAFT) -> Flight:
     return Flight(track, _truth(aircraft, time, core, earth, scalar, own))
 
 
-def write_flight(folder: Path, sample: Sample, aircraft: Aircraft = AIRCRAFT) -> list[Path]:
-    """Write the flight over a sample as track/1 and as CSV, and the truth; the same bytes always.
+def diurnal(time: NDArray[np.datetime64]) -> Floats:
+    """What the flight's day adds to the total field (n,), nT: a quiet day's curve and a wave."""
+    hours = (time - time.astype("datetime64[D]")) / np.timedelta64(1, "h")
+    day = -16.0 * np.exp(-0.5 * ((hours - 20.0) / 2.5) ** 2)
+    return np.asarray(day + 3.0 * np.sin(2.0 * np.pi * hours / 0.8))
 
-    Returns ``<name>-flight.nc``, ``<name>-flight.csv``, the CSV's source TOML and
-    ``<name>-flight-truth.nc``. The CSV has a line of column names with units; attitude is
-    w, x, y, z.
+
+def on_its_day(flight: Flight) -> Flight:
+    """The flight with the variation of its day, which lies along the field wherever it is."""
+    varied = diurnal(flight.track["time"].values)
+    track, truth = flight.track.copy(), flight.truth.copy()
+    total = truth["external_field_total"]
+    track["field_total"] = track["field_total"].copy(data=track["field_total"].values + varied)
+    larger = 1.0 + varied / total.values
+    track["field_body"] = track["field_body"].copy(
+        data=track["field_body"].values * larger[:, None]
+    )
+    truth["external_field_total"] = total.copy(data=total.values + varied)
+    truth["diurnal"] = ("time", varied, {"units": "nT"})
+    return Flight(track, truth)
+
+
+def write_base_station(folder: Path, stem: str, sample: Sample, day: str) -> list[Path]:
+    """The base station's day as IAGA-2002 and its source TOML, ``<stem>.toml``."""
+    time = np.datetime64(day, "m") + np.arange(1440)
+    place = _BASE.latitude, _BASE.longitude, _BASE.elevation_m
+    core = core_field(replace(sample.spec, epoch=day), *place)
+    total = float(np.linalg.norm(core))
+    values = core * (1.0 + diurnal(time)[:, None] / total)
+    columns = np.column_stack([values, np.linalg.norm(values, axis=1)])
+    return write_record(folder, stem, _BASE, time, columns)
+
+
+def write_flight(folder: Path, sample: Sample, aircraft: Aircraft = AIRCRAFT) -> list[Path]:
+    """Write the flight over a sample, on its day, as track/1 and as CSV; the same bytes always.
+
+    Returns ``<name>-flight.nc``, ``<name>-flight.csv``, the CSV's source TOML,
+    ``<name>-flight-truth.nc`` and what `write_base_station` does. The CSV has a line of column
+    names with units; attitude is w, x, y, z.
     """
-    flight = fly(sample, aircraft)
+    flight = on_its_day(fly(sample, aircraft))
     stem = f"{sample.spec.name}-flight"
     track, table, toml, truth = (
         folder / f"{stem}{end}" for end in (".nc", ".csv", ".toml", "-truth.nc")
@@ -162,7 +208,8 @@ def write_flight(folder: Path, sample: Sample, aircraft: Aircraft = AIRCRAFT) ->
     encoding: dict[Any, Any] = {name: {"_FillValue": None} for name in flight.truth.data_vars}
     with atomic_path(truth) as temporary:
         flight.truth.to_netcdf(temporary, engine="netcdf4", format="NETCDF4", encoding=encoding)
-    return [track, table, toml, truth]
+    base = write_base_station(folder, f"{sample.spec.name}-base", sample, aircraft.start[:10])
+    return [track, table, toml, truth, *base]
 
 
 def _write_csv(track: xr.Dataset, path: Path) -> None:

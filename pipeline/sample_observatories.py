@@ -44,6 +44,16 @@ def write_observatories(folder: Path, name: str, sample: TemporalSample) -> list
     return [*tomls, indices, *data, kp, days]
 
 
+def write_record(
+    folder: Path, stem: str, spec: StationSpec, time: NDArray[np.datetime64], columns: Any
+) -> list[Path]:
+    """A station's record as ``<stem>.min.gz`` and its ``<stem>.toml``; columns as reported."""
+    path = folder / f"{stem}.min.gz"
+    text = _iaga_header(spec) + "".join(_iaga_rows(time, columns))
+    _write(path, gzip.compress(text.encode("ascii"), mtime=0))
+    return [_write_toml(folder, stem, spec.name, [path]), path]
+
+
 def write_truth(path: Path, sample: TemporalSample) -> None:
     """Write what the records are made of: see `truth_dataset`."""
     dataset = truth_dataset(sample)
