@@ -111,7 +111,16 @@ def _pictures(release: Release) -> Iterable[str]:
 
 
 def _preview(release: Release, path: str) -> str:
-    return _image(release.file(path), Path(path).stem)
+    return _image(release.file(path), _caption(Path(path).stem))
+
+
+def _caption(stem: str) -> str:
+    """The picture's own name, or for an observatory its code and what is drawn."""
+    if not stem.startswith("temporal-"):
+        return stem
+    code, _, kind = stem.removeprefix("temporal-").partition("-")
+    words = kind.replace("sigma-tau", "sigma and tau").replace("-", " ")
+    return f"Observatory {code}: {words}"
 
 
 def _or_problem(make: Callable[[], str]) -> str:

@@ -194,7 +194,10 @@ def sigma_tau_figure(fits: xr.Dataset) -> Figure:
     axes.legend(fontsize=9, frameon=False, loc="lower right")
     hours = float(fits.attrs["segment_s"]) / _SECONDS_PER_HOUR
     _title(figure, None, f"{fits['iaga_code'].values[0]}: segments of {hours:g} h, total field")
-    _below(figure, "Maximum likelihood about zero. Hollow: tau has no upper bound.")
+    _below(
+        figure,
+        "Maximum likelihood about zero. Hollow: tau is longer than its segment, or unbounded.",
+    )
     return figure
 
 

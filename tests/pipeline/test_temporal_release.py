@@ -160,6 +160,15 @@ def test_inputs_provenance_and_pictures_are_listed(built: Built, release: Releas
         assert 20_000 < len(release.file(path)) < 1_000_000
 
 
+def test_the_report_shows_every_observatory(built: Built, tmp_path: Path) -> None:
+    page = tmp_path / "report.html"
+    assert main(["report", str(built.store / "demo/1.0.0"), "--out", str(page)]) == 0
+    text = page.read_text("utf-8")
+    for code in ("XMD", "XEQ"):
+        for what in ("quiet days", "residual", "autocorrelation", "sigma and tau"):
+            assert f"Observatory {code}: {what}" in text
+
+
 def test_building_again_changes_nothing_and_other_months_are_minor(
     built: Built, capsys: Capture
 ) -> None:
