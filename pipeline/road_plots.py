@@ -126,6 +126,8 @@ def _features(road: xr.Dataset) -> list[tuple[float, float, int]]:
 
 
 def _draw_quality(panels: list[Axes], road: xr.Dataset) -> None:
+    from matplotlib.ticker import MaxNLocator
+
     distance, share = road["distance"].values, road["matchability"].values
     panels[0].plot(distance, share, color="#000000", linewidth=0.8)
     panels[0].set(ylim=(0.0, 1.05), ylabel="matchability")
@@ -135,8 +137,8 @@ def _draw_quality(panels: list[Axes], road: xr.Dataset) -> None:
     sigma = road["field_body_uncertainty"].values
     for axis, colour in enumerate(_COLOURS):
         panels[1].plot(distance, sigma[:, axis], color=colour, label=_AXES[axis], linewidth=0.8)
-    panels[1].set(ylim=(0.0, None), ylabel="1 sigma (nT)")
+    panels[1].set(ylim=(0.0, 1.4 * float(sigma.max())), ylabel="1 sigma (nT)")
     panels[1].legend(frameon=False, ncols=3, fontsize=8, loc="upper right")
     panels[2].step(distance, road["passes"].values, color="#000000", where="mid", linewidth=0.8)
     panels[2].set(ylim=(0.0, None), ylabel="passes")
-    panels[2].yaxis.get_major_locator().set_params(integer=True)
+    panels[2].yaxis.set_major_locator(MaxNLocator(integer=True))

@@ -90,7 +90,7 @@ def build_roads(
     made = [path for roads in wanted for path in _maps(roads, tracks)]
     steps.report("matchability")
     maps = _written(made, own / "maps")
-    pictures = {}
+    pictures: dict[str, Path] = {}
     for path in maps.values():
         steps.report(f"drawing road {path.stem}")
         pictures |= _drawn(path, folder / "preview")

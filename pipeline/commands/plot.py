@@ -104,7 +104,7 @@ def _road_figure(folder: Path, name: str, quantity: str) -> Figure:
         )
     release.roads[name]  # verifies the file, which is then drawn with all that it holds
     with open_artifact(folder / release.manifest.roads[name].path) as road:
-        return road_figure(road, quantity)
+        return road_figure(road, "matchability" if quantity == "matchability" else "field")
 
 
 def _temporal_picture(folder: Path, code: str, kind: str) -> bytes:
