@@ -41,7 +41,7 @@ class RoadsTable(Params):
         "s", default=None, doc="Of align-log: lag of the attitude; default estimated."
     )
     fix_lag_s: float | None = quantity(
-        "s", default=None, doc="Of align-log: lag of the fixes; default estimated."
+        "s", default=None, doc="Of align-log: lag of the fixes; default zero."
     )
     spacing_m: float = quantity("m", default=1.0, gt=0, doc="Distance between the map's points.")
     split: bool = quantity(
