@@ -132,6 +132,15 @@ def test_files_hold_the_flight(sample: Sample, flight: Flight, tmp_path: Path):
 # Compensation of the sample
 
 
+def test_a_map_needs_to_know_the_day(flight: Flight):
+    day = on_its_day(flight)
+    without = day.truth["external_field_total"] - day.truth["diurnal"]
+    track = day.track.assign(expected_total=without.assign_attrs(units="nT"))
+    assert error(day, fit(track, form="map_based")) > 1.0
+    known = track.assign(diurnal=day.truth["diurnal"])
+    assert error(day, fit(known, form="map_based")) < 0.047  # found 0.046
+
+
 @pytest.mark.parametrize(("factor", "rms_nt"), [(1.0, 0.0211), (2.0, 0.0849), (4.0, 0.3401)])
 def test_what_the_linear_model_leaves_out(sample: Sample, factor: float, rms_nt: float):
     """|B + b| - |B| less its linear part is b_perpendicular^2 / 2B: it grows with the square."""

@@ -90,7 +90,8 @@ def fit_tolles_lawson(track: xr.Dataset, *, params: FitTollesLawsonParams) -> xr
 
     Map-less: the columns of A and `field_total`, both band-passed, so that the Earth's field and
     its anomalies, which vary slowly, drop out. Map-based: A, and `field_total` less the track's
-    `expected_total` (core field and map); a constant is free, for the map's level and the day.
+    `expected_total` (core field and map); a constant is free, for the map's level. A track's
+    `diurnal` is part of what is expected.
 
     Parameters
     ----------
@@ -190,7 +191,7 @@ def _usable(track: xr.Dataset, params: FitTollesLawsonParams) -> NDArray[np.bool
     usable: NDArray[np.bool_] = np.isfinite(track["field_total"].values)
     usable &= np.isfinite(direction_cosines(_body(track))).all(axis=1)
     if params.form == "map_based":
-        usable &= np.isfinite(track["expected_total"].values)
+        usable &= np.isfinite(_expected(track))
     if params.span is not None:
         first, last = (_time(text) for text in params.span)
         time = track["time"].values
@@ -226,7 +227,7 @@ def _model(
         )
     response = track["field_total"].values.astype(np.float64)
     if params.form == "map_based":
-        response = response - track["expected_total"].values
+        response = response - _expected(track)
     return columns, response
 
 
@@ -353,6 +354,12 @@ def _record(
         "manoeuvres": len(manoeuvres),
         "headings": len(set(heading_groups(manoeuvres))),
     }
+
+
+def _expected(track: xr.Dataset) -> Floats:
+    """Core field, map and, where the track has it, the variation of the day (time,), nT."""
+    expected: Floats = track["expected_total"].values.astype(np.float64)
+    return expected + track["diurnal"].values if "diurnal" in track else expected
 
 
 STAGE = Stage(
