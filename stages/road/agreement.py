@@ -12,7 +12,7 @@ _MEANING = {
     "road": "the road",
     "spacing_m": "the spacing",
     "frame": "the frame",
-    "calibrated": "whether they are calibrated",
+    "calibrated": "'calibrated'",
     "direction": "the direction",
     "height_reference": "what heights count from",
 }
@@ -36,7 +36,12 @@ def check_passes(passes: Sequence[xr.Dataset], road: xr.Dataset | None) -> None:
 
 
 def _name(dataset: xr.Dataset) -> str:
-    return " and ".join(f"'{name}'" for name in dataset["pass_name"].values)
+    first, *others = (str(name) for name in dataset["pass_name"].values)
+    return f"pass '{first}'" if not others else f"the map of '{first}' and {len(others)} others"
+
+
+def _shown(value: object) -> str:
+    return f"'{value}'" if isinstance(value, str) else f"{value:g}"
 
 
 def _check_single(one: xr.Dataset, road: xr.Dataset | None) -> None:
@@ -58,8 +63,8 @@ def _check_alike(first: xr.Dataset, other: xr.Dataset) -> None:
     for key, meaning in _MEANING.items():
         if first.attrs[key] != other.attrs[key]:
             raise ContractError(
-                f"{meaning} of {_name(first)} is {first.attrs[key]!r}, of {_name(other)} "
-                f"{other.attrs[key]!r}",
+                f"{meaning} of {_name(first)} is {_shown(first.attrs[key])}, of {_name(other)} "
+                f"{_shown(other.attrs[key])}",
                 where=f"passes attrs.{key}",
                 expected="the same in all",
                 remedy="calibrate all passes, or none"

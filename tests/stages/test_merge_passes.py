@@ -242,14 +242,23 @@ def _uncalibrated() -> dict[str, object]:
 
 REFUSED = [
     Refused("one pass", lambda: {"given": passes()[:1]}, "there is one pass"),
-    Refused("frame", _attr(frame="north, east, down"), "the frame of 'car-10' is 'body"),
-    Refused("spacing", _attr(spacing_m=3.0), "the spacing of 'car-10' is 1.0, of 'car-11' 3.0"),
-    Refused("road", _attr(road="other"), "the road of 'car-10' is 'road', of 'car-11' 'other'"),
-    Refused("direction", _attr(direction="backward"), "the direction of 'car-10'"),
+    Refused("frame", _attr(frame="north, east, down"), "the frame of pass 'car-10' is 'body"),
+    Refused("spacing", _attr(spacing_m=3.0), "spacing of pass 'car-10' is 1, of pass 'car-11' 3;"),
+    Refused(
+        "road",
+        _attr(road="other"),
+        "the road of pass 'car-10' is 'road', of pass 'car-11' 'other'",
+    ),
+    Refused(
+        "another road than the map's",
+        lambda: {"given": [passes()[3].assign_attrs(road="other")], "road": merge(passes()[:3])},
+        "the road of the map of 'car-10' and 2 others is 'road', of pass '.*' 'other'",
+    ),
+    Refused("direction", _attr(direction="backward"), "the direction of pass 'car-10'"),
     Refused(
         "calibrated with uncalibrated",
         _attr(calibrated="false"),
-        "whether they are calibrated of 'car-10' is 'true', of 'car-11' 'false'.*calibrate all",
+        "'calibrated' of pass 'car-10' is 'true', of pass 'car-11' 'false'.*calibrate all",
     ),
     Refused(
         "uncalibrated vehicles", _uncalibrated, r"uncalibrated passes of different.*car, truck"
