@@ -90,10 +90,17 @@ def _draw_course(
     beyond = "both" if kind == "field" else "neither"
     axes.figure.colorbar(dots, ax=axes, label=label, extend=beyond, aspect=20)
     start = 0 if road.attrs["direction"] == "forward" else -1
+    inward = 18 if latitude[start] < latitude.mean() else -22
     axes.annotate(
-        "start", (longitude[start], latitude[start]), xytext=(0, -22), textcoords="offset points",
-        ha="center", arrowprops={"arrowstyle": "->"}, fontsize=8, zorder=3,
-    )  # fmt: skip
+        "start",
+        (longitude[start], latitude[start]),
+        xytext=(0, inward),
+        textcoords="offset points",
+        ha="center",
+        arrowprops={"arrowstyle": "->"},
+        fontsize=8,
+        zorder=3,
+    )
     axes.set(xlabel="longitude (degrees east)", ylabel="latitude (degrees north)")
     axes.ticklabel_format(useOffset=False)
     axes.locator_params(axis="both", nbins=5)

@@ -169,9 +169,7 @@ def _u_turns(shape: _Shape) -> Real:
     steps = int(_U_TURN_M / _STEP_M)
     found = []
     for peak in _peaks(np.abs(_turned(shape.course, steps)), np.radians(_U_TURN_DEG)):
-        around = np.arange(
-            max(peak - steps // 2, 0), min(peak + steps // 2, len(shape.course) - 1) + 1
-        )
+        around = np.arange(max(peak - steps, 0), min(peak + steps, len(shape.course) - 1) + 1)
         course = shape.course[around]
         left = around[np.abs(course - course[0]) > np.radians(_STRAIGHT_DEG)]
         joined = around[np.abs(course - course[-1]) > np.radians(_STRAIGHT_DEG)]
