@@ -114,7 +114,7 @@ def test_the_answer_is_near_the_truth(release: Release) -> None:
 
 def test_the_map_is_closer_to_the_truth_than_any_pass(built: Built) -> None:
     found = closeness("loop-forward", built.work / "demo/roads")
-    # Measured: 447 nT; passes 622 to 859 nT.
+    # Measured: some 450 nT; passes 620 to 870 nT.
     assert len(found.passes) == 4
     assert found.rms < 0.85 * min(found.rms_of_passes.values())
 
