@@ -158,8 +158,9 @@ def _identity(road: xr.Dataset) -> list[tuple[Any, ...]]:
 def _add(merged: Merged, one: xr.Dataset, params: MergeParams) -> None:
     aligned = _align(merged, one, params)
     vehicle = merged.statistics.index(str(one["vehicle_name"].values[0]))
+    already = (merged.flag & np.uint8(RoadFlag.TRANSIENT_DROPPED)) != 0
     where, dropped = drop_transients(
-        merged.statistics, vehicle, aligned.field, aligned.where, merged.spacing
+        merged.statistics, vehicle, aligned.field, aligned.where, merged.spacing, already
     )
     before = merged.statistics.passes[where, None].astype(np.float64)
     merged.statistics.add(vehicle, aligned.field, where)

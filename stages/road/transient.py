@@ -27,18 +27,21 @@ _CLEARLY = 3.0
 
 
 def drop_transients(
-    statistics: Statistics, vehicle: int, field: Real, where: Mask, spacing_m: float
-) -> tuple[Mask, Mask]:
+    statistics: Statistics, vehicle: int, field: Real, where: Mask, spacing_m: float,
+    already: Mask,
+) -> tuple[Mask, Mask]:  # fmt: skip
     """Judge a new pass against those before it, and two before it by the new one.
 
     Where two or more passes agree and the new one differs, the new one is dropped. Where two
     that were there differ, the new one tells which of them is right: from the mean and the
     square sum of two passes both follow, but for the sign in each axis. With one pass before
-    it nothing can be told, and both stay.
+    it nothing can be told, and both stay. Where one was dropped before, the new one stays: what
+    two passes met stands there.
 
     Parameters
     ----------
     field, where : (point, 3) nT, and the points (point,) where the new pass has one.
+    already : (point,) where a pass was dropped before.
 
     Returns
     -------
@@ -55,6 +58,8 @@ def drop_transients(
     own_scale = _scale(np.where(where[:, None], field, expected), difference, where, spacing_m)
     disputed = _disputed(statistics, own_scale, before, spacing_m)
     lone = _stretches(difference, scale, where & (before > 1) & ~disputed)
+    for stretch in _runs(lone):
+        lone[stretch] &= not already[stretch].any()
     dropped = lone.copy()
     for stretch in _runs(disputed & where):
         dropped[stretch] |= _settle(statistics, field, stretch, where, spacing_m)

@@ -159,6 +159,17 @@ def test_a_truck_that_one_pass_met_is_dropped(
     assert flag[~near].mean() < 0.15
 
 
+def test_what_two_passes_met_stands_there() -> None:
+    """The first to meet it is dropped; the next are not: no steel vanishes from the map."""
+    car = Vehicle.random("car", 1)
+    calm = [one_pass(car, 20 + i) for i in range(3)]
+    met = [one_pass(car, 23 + i, trucks=(TRUCK,)) for i in range(3)]
+    made = merge([*calm, *met])
+    assert (made["passes"].values[truck_at(made)] == 5).all()
+    one_by_one = merge([met[2]], road=merge([*calm, *met[:2]]))
+    np.testing.assert_array_equal(one_by_one["passes"], made["passes"])
+
+
 def test_of_two_passes_neither_is_dropped() -> None:
     car = Vehicle.random("car", 1)
     made = merge([one_pass(car, 20), one_pass(car, 21, trucks=(TRUCK,))])
