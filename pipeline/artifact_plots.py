@@ -11,6 +11,7 @@ import xarray as xr
 from magtiles.pipeline.artifacts import check_artifact, open_artifact
 from magtiles.pipeline.calibration_plots import calibration_figure
 from magtiles.pipeline.compensation_plots import compensation_figure
+from magtiles.pipeline.road_plots import road_figure
 from magtiles.pipeline.track_plots import track_figure
 from magtiles.schemas.errors import UsageError
 
@@ -22,9 +23,14 @@ def _draw_track(track: xr.Dataset) -> Figure:
     return compensation_figure(track) if "field_total_raw" in track else track_figure(track)
 
 
+def _draw_road(road: xr.Dataset) -> Figure:
+    return road_figure(road, "field")
+
+
 _FIGURES: dict[str, Callable[[xr.Dataset], Figure]] = {
     "track": _draw_track,
     "track-anomaly": track_figure,
+    "road-map": _draw_road,
 }
 """Contract, without its version, to what draws it."""
 

@@ -23,7 +23,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "release",
         type=Path,
         metavar="RELEASE",
-        help="folder of a release, or a file: a track's path, or its compensation; a calibration",
+        help="folder of a release, or a file: a track's path, or its compensation; a road map; "
+        "a calibration",
     )
     parser.add_argument(
         "--track", type=Path, metavar="FILE", help="the track that a calibration was made from"
