@@ -70,7 +70,8 @@ def _title(road: xr.Dataset, kind: Kind) -> str:
     state = "calibrated" if road.attrs["calibrated"] == "true" else "uncalibrated"
     name = f"{road.attrs['road']}, driven {road.attrs['direction']}"
     passes, vehicles = road.sizes["pass"], road.sizes["vehicle"]
-    return f"{name}: {what}; {passes} passes, {vehicles} vehicles, {state}"
+    of = f"{passes} pass{'es' * (passes > 1)}, {vehicles} vehicle{'s' * (vehicles > 1)}"
+    return f"{name}: {what}; {of}, {state}"
 
 
 def _draw_course(
