@@ -60,7 +60,7 @@ def world_model(spec: WorldSpec = WORLD) -> FieldModel:
         n_max=spec.degree,
         reference_radius_km=igrf.reference_radius_km,
         epochs=np.array([spec.epoch]),
-        coefficients=np.round(gauss, 6)[None],
+        coefficients=np.asarray(np.round(gauss, 6)[None], np.float64),
         secular_variation=np.round(variation, 6),
         valid=(spec.epoch, spec.epoch + _YEARS),
     )

@@ -64,7 +64,8 @@ def to_wgs84(
             where=f"crs '{crs.name}'",
             expected="a CRS whose datum is stated",
             remedy=f"state the whole CRS with its datum, as in crs = '{_with_datum(crs)}' in "
-            "its source TOML, or accept an error of up to some 200 m with allow_ballpark_datum = true",
+            "its source TOML, or accept an error of up to some 200 m with "
+            "allow_ballpark_datum = true",
         )
     return group.transformers[0]
 

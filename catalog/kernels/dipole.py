@@ -45,7 +45,7 @@ def dipole_field(points: Floats, positions: Floats, moments: Floats) -> tuple[Fl
 
 
 def dipole_vector(points: Floats, positions: Floats, moments: Floats) -> Floats:
-    """The field (n, 3) of `dipole_field` in nT without its gradient, in little over half the time."""
+    """The field (n, 3) of `dipole_field`, nT, without its gradient: takes half as long."""
     field = np.empty((len(points), 3))
     step = max(1, _PAIRS // max(1, len(positions)))
     for start in range(0, len(points), step):

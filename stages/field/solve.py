@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit, prange
 
+from magtiles.schemas.errors import CoverageError
 from magtiles.stages.field.direction import AmbientSource
 from magtiles.stages.field.padding import Padding, pad
 from magtiles.stages.field.plane import STEP_M, Plane, coarse_axis
@@ -32,6 +33,7 @@ _log = logging.getLogger(__name__)
 
 _TOLERANCE = 1e-3
 _ROUNDS = 8
+_UNSETTLED = 0.05
 
 Direction = tuple[Real, Real, Real]
 
@@ -131,16 +133,24 @@ def follow(
         correction = _varying_part(total, inversion, variation, offset, shape)
         last, change = change, float(np.linalg.norm(correction - previous)) / size
         if change > last:
-            _log.warning(
-                "the ambient direction varies too much over this map to be followed exactly "
-                "(last change %.1f %%): split the region",
-                100 * change,
-            )
+            _accept_or_refuse(last)
             break
         total, previous, first = forward(padded - correction), correction, min(first, change)
         if change * first < _TOLERANCE:
             break
     return total
+
+
+def _accept_or_refuse(change: float) -> None:
+    """Warn of, or refuse, substitution that came no nearer than a relative `change`."""
+    told = f"the ambient direction varies too much over this map (unsettled by {change:.1%})"
+    if change > _UNSETTLED:
+        raise CoverageError(
+            told,
+            expected=f"a region over which it settles within {_UNSETTLED:.0%}",
+            remedy="choose a smaller region, above all one that keeps off the magnetic equator",
+        )
+    _log.warning("%s: split the region for more", told)
 
 
 def _varying_part(

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from magtiles.catalog.flags import TrackFlag, flag_attributes
 from magtiles.catalog.kernels.geodesy import wrap_longitude
+from magtiles.catalog.releases.record_file import SECONDS
 from magtiles.catalog.releases.temporal import TemporalModel
 from magtiles.catalog.releases.temporal_file import TemporalData
-from magtiles.catalog.releases.temporal_table import SECONDS, TEMPORAL_VARIABLES
+from magtiles.catalog.releases.temporal_table import TEMPORAL_VARIABLES
 from magtiles.schemas.errors import ContractError, CoverageError
 from magtiles.stages.declare import Params, Stage, quantity
 from magtiles.stages.field.core_field import total_anomaly

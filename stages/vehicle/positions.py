@@ -84,7 +84,7 @@ def positions_at(time: Times, fixes: Fixes, *, max_gap_s: float) -> Positions:
     place, flag = np.full((3, time.size), np.nan), np.zeros(time.size, dtype=np.uint16)
     good = fixes.valid
     if not good.any():
-        return Positions(*place, flag | np.uint16(TrackFlag.NO_FIX))
+        return Positions(place[0], place[1], place[2], flag | np.uint16(TrackFlag.NO_FIX))
     turns = np.degrees(np.unwrap(np.radians(fixes.longitude[good])))
     known = _Known(
         fixes.time[good],

@@ -12,6 +12,7 @@ from magtiles.catalog.kernels.geodesy import metres_per_degree
 from magtiles.catalog.releases.anomaly import Anomaly
 from magtiles.pipeline.build import build_product
 from magtiles.pipeline.validate import validate_release
+from magtiles.schemas.errors import CoverageError
 from magtiles.stages.ingest.grid import ingest_grid
 from magtiles.stages.ingest.source import IngestGridParams
 
@@ -142,3 +143,14 @@ def test_values_across_the_date_line_are_those_of_the_grid(
     assert (
         error < 1.25 * across.uncertainty(lat, lon, 3988.0)[known].mean() < 0.6 * own[known].std()
     )
+
+
+def test_a_wide_map_across_the_dip_equator_is_refused(real_data: Path, tmp_path: Path) -> None:
+    """There substitution diverges, and what it gave correlated with the data by 0.59 only."""
+    anomaly = (
+        "heights_m = [50000]\nregion = {latitude = [-20, 20], longitude = [170, -170]}\n"
+        "spacing_m = 100000\n"
+    )
+    with pytest.raises(CoverageError, match=r"varies too much .*magnetic equator"):
+        build(tmp_path, real_data, "EMAG2_V2_1x1.grd", anomaly, "no_data = -99999.0")
+    assert not (tmp_path / "store").exists() or not list((tmp_path / "store").iterdir())

@@ -138,7 +138,10 @@ def test_truth_is_beside_the_records(sample: TemporalSample, tmp_path: Path) -> 
     with xr.open_dataset(tmp_path / "truth.nc", engine="netcdf4") as truth:
         assert truth.equals(truth_dataset(sample))
         month = truth["baseline"].sel(month="2024-03-01").values
-        assert pytest.approx(
-            quiet_curve(MIDDLE, np.arange(1440.0)) * (1.0 + 0.08 * 30.0 / 30.0), abs=1e-9
-        ) == month[0].T
+        assert (
+            pytest.approx(
+                quiet_curve(MIDDLE, np.arange(1440.0)) * (1.0 + 0.08 * 30.0 / 30.0), abs=1e-9
+            )
+            == month[0].T
+        )
         assert truth["sigma"].values[1, :, 1].tolist() == list(EQUATOR.sigma_nt[1])
