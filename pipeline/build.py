@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from magtiles.pipeline import receipts
-from magtiles.pipeline.cutting import cutting
+from magtiles.pipeline.cutting import Cutter, worth_processes
 from magtiles.pipeline.model_map import plan_model_map
 from magtiles.pipeline.product import ModelMap, Product, SurveyMap, load_product
 from magtiles.pipeline.progress import Progress, silent
 from magtiles.pipeline.roads_part import build_roads
 from magtiles.pipeline.steps import MapPlan, PartResult, Steps
 from magtiles.pipeline.survey_map import plan_survey_map
+from magtiles.pipeline.tasks import Workplace, working
 from magtiles.pipeline.temporal_part import build_temporal
 from magtiles.schemas.errors import CoverageError, MagtilesError, ParameterError, SourceError
 from magtiles.stages.release.provenance import resource, slsa_predicate
@@ -30,6 +31,7 @@ def build_product(
     work: Path,
     data: Path | None = None,
     progress: Progress = silent,
+    scheduler: str | None = None,
 ) -> PublishResult:
     """Build the release of a product TOML and publish it in `store`.
 
@@ -40,6 +42,8 @@ def build_product(
         what has changed.
     data : folder of local copies of the source's files; default beside the source TOML.
     progress : told of each step.
+    scheduler : address of a dask scheduler whose workers see `store` and `work`; default a
+        local cluster where the work is worth it. What comes out is the same.
 
     Raises MagtilesError subclasses for bad sources, data, parameters and versions.
     """
@@ -47,7 +51,7 @@ def build_product(
     for folder in (store, work):
         _check_writable(folder)
     with _asked_by(product):
-        return _build(wanted, store, work, data, progress)
+        return _build(wanted, store, work, data, progress, scheduler)
 
 
 def _check_writable(folder: Path) -> None:
@@ -75,7 +79,12 @@ def _asked_by(product: Path) -> Iterator[None]:
 
 
 def _build(
-    wanted: Product, store: Path, work: Path, data: Path | None, progress: Progress
+    wanted: Product,
+    store: Path,
+    work: Path,
+    data: Path | None,
+    progress: Progress,
+    scheduler: str | None,
 ) -> PublishResult:
     folder = work / wanted.product.name
     more = 0 if wanted.temporal is None else wanted.temporal.steps
@@ -83,23 +92,36 @@ def _build(
         more += wanted.map.surface.steps
     more += sum(roads.steps for roads in wanted.roads)
     steps = Steps(progress, total=4 + len(wanted.map.table.heights_m) + more)
-    plan = _plan(wanted, folder, data, steps)
-    parts = []
-    if wanted.temporal is not None:
-        _require_core_field(plan)
-        parts.append(build_temporal(wanted.temporal, folder, data, steps))
-    if wanted.roads:
-        parts.append(build_roads(wanted.roads, folder, data, steps))
-    with cutting(plan.lattice, len(plan.heights)) as cutter:
-        levels, pictures = [], []
-        for height in plan.heights:
-            levels.append(plan.level(height))
-            pictures.append(folder / "preview" / f"{height:.12g}m.png")
-            cutter.draw(levels[-1], pictures[-1], wanted.product.name, wanted.product.version)
-        cut = cutter.cut(levels, plan.surface, folder / "tiles", progress)
-        cutter.finish_drawing()
+    with working(scheduler, folder) as place:
+        plan = _plan(wanted, folder, data, steps)
+        parts = []
+        if wanted.temporal is not None:
+            _require_core_field(plan)
+            parts.append(build_temporal(wanted.temporal, folder, data, steps))
+        if wanted.roads:
+            parts.append(build_roads(wanted.roads, folder, data, steps))
+        levels, pictures, cut = _make_tiles(wanted, plan, folder, progress, place)
     steps.report("publishing")
     return _publish(wanted, store, plan, cut, levels, pictures, parts)
+
+
+def _make_tiles(
+    wanted: Product, plan: MapPlan, folder: Path, progress: Progress, place: Workplace
+) -> tuple[list[Path], list[Path], list[MeasuredTile]]:
+    """All levels, their pictures, and the tiles cut from them."""
+    levels, pictures = [], []
+    cutter = Cutter(plan.lattice, place.tasks)
+    if plan.begin is not None or worth_processes(plan.lattice, len(plan.heights)):
+        place.expand()
+    if plan.begin is not None:
+        plan.begin(place.tasks)
+    for height in plan.heights:
+        levels.append(plan.level(height))
+        pictures.append(folder / "preview" / f"{height:.12g}m.png")
+        cutter.draw(levels[-1], pictures[-1], wanted.product.name, wanted.product.version)
+    cut = cutter.cut(levels, plan.surface, folder / "tiles", progress)
+    cutter.finish_drawing()
+    return levels, pictures, cut
 
 
 def _plan(wanted: Product, folder: Path, data: Path | None, steps: Steps) -> MapPlan:

@@ -60,6 +60,7 @@ BAD_DATA, BAD_USE, INTERRUPTED, BROKEN_PIPE = 1, 2, 130, 141
 _EXTRA = (
     "cdflib",
     "cryptography",
+    "distributed",
     "google.protobuf",
     "h5py",
     "harmonica",

@@ -26,6 +26,9 @@ _SURFACES = {
     "terrain": "terrain",
 }
 
+_PICTURE_NODES = 2048
+"""Nodes a side above which every second, third... will do for a picture."""
+
 
 def release_figure(folder: Path, *, height: float | None, quantity: str) -> Figure:
     """Draw one quantity of a release at one of its levels; None is the lowest.
@@ -58,7 +61,8 @@ def release_figure(folder: Path, *, height: float | None, quantity: str) -> Figu
 
 def write_preview(level: xr.Dataset, path: Path, product: str, version: str) -> None:
     """Draw the total-field anomaly of a component grid (without its halo) to a PNG."""
-    inner = level.isel(latitude=slice(HALO, -HALO), longitude=slice(HALO, -HALO))
+    thin = max(1, max(level.sizes["latitude"], level.sizes["longitude"]) // _PICTURE_NODES)
+    inner = level.isel(latitude=slice(HALO, -HALO, thin), longitude=slice(HALO, -HALO, thin))
     height, reference = float(level["height"]), str(level.attrs["height_reference"])
     figure = preview_figure(
         inner["latitude"].values,

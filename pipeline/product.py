@@ -118,6 +118,13 @@ class AnomalyTable(Params):
     allow_downward_continuation: bool = quantity(
         "1", default=False, doc="Permit levels below the survey (flagged)."
     )
+    block_nodes: int | None = quantity(
+        "1",
+        default=None,
+        ge=128,
+        doc="Make levels in blocks of so many nodes a side; default blocks of 2048 where the "
+        "survey has more than 4096 x 4096 nodes, or a level twice that.",
+    )
 
 
 class ModelTable(Params):

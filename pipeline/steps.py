@@ -11,6 +11,7 @@ from magtiles.catalog.kernels.bspline import HALO
 from magtiles.catalog.releases.lattice import Lattice
 from magtiles.pipeline.progress import Progress
 from magtiles.pipeline.runner import StageResult, run_stage
+from magtiles.pipeline.tasks import Tasks
 from magtiles.stages.declare import Stage
 
 
@@ -28,6 +29,13 @@ class Steps:
     def expect(self, more: int) -> None:
         """Count on more steps than were known of at first."""
         self._total += more
+
+    def within(self, what: str) -> Callable[[int, int], None]:
+        """How to tell of parts of one step: called with how many are done and how many there are.
+
+        The step itself does not count before the next one is reported.
+        """
+        return lambda done, total: self._progress(what, done, total)
 
     def run(
         self, stage: Stage, inputs: Mapping[str, Any], out: Path, params: Mapping[str, Any]
@@ -51,6 +59,8 @@ class MapPlan:
     source : the TOML or coefficient file that the product names.
     core_field : file of the coefficients that the anomaly counts from, if they are at hand.
     surface : ellipsoidal height of what the heights count from, on the same nodes, if known.
+    begin : asks for all that levels made in blocks need, before the first of them; none where
+        they are made at once.
     """
 
     lattice: Lattice
@@ -61,6 +71,7 @@ class MapPlan:
     source: Path
     core_field: Path | None
     surface: Path | None = None
+    begin: Callable[[Tasks], None] | None = None
 
 
 def node_axes(lattice: Lattice) -> dict[str, tuple[float, float, int]]:

@@ -12,9 +12,11 @@ import numpy as np
 
 from magtiles.catalog.releases.lattice import Lattice
 from magtiles.pipeline.artifacts import open_artifact
+from magtiles.pipeline.large_levels import LevelJob, LevelTasks, begin, finish
 from magtiles.pipeline.product import AnomalyTable, SurveyMap
 from magtiles.pipeline.source_paths import data_files, manifest_inputs
 from magtiles.pipeline.steps import MapPlan, Steps, node_axes
+from magtiles.pipeline.tasks import Tasks
 from magtiles.schemas.errors import CoverageError, ParameterError
 from magtiles.stages.field import components, crop, voids
 from magtiles.stages.field.extent import data_bounds
@@ -58,15 +60,17 @@ def plan_survey_map(source: SurveyMap, folder: Path, data: Path | None, steps: S
         surface = source.surface.lay(survey.grid, lattice, folder, data, steps)
         inputs += source.surface.inputs(data)
     names = ["survey.nc", *(["cropped.nc"] if wanted.region is not None else []), "filled.nc"]
+    levels = Levels(wanted, survey, lattice, folder, steps)
     return MapPlan(
         lattice=lattice,
         heights=heights,
-        level=lambda height: _level(wanted, survey, lattice, height, folder, steps),
+        level=levels.make,
         artifacts=[*(folder / name for name in names), *surface],
         inputs=inputs,
         source=source.path,
         core_field=igrf_coefficients(survey.reference_field),
         surface=surface[-1] if surface else None,
+        begin=(lambda tasks: levels.begin(tasks, heights)) if levels.are_large else None,
     )
 
 
@@ -135,22 +139,51 @@ def _default_spacing(survey: Survey, heights: Sequence[float]) -> float:
     return min([survey.cell_m, *(g / 2 for g in gains)])
 
 
-def _level(
-    wanted: AnomalyTable,
-    survey: Survey,
-    lattice: Lattice,
-    height: float,
-    folder: Path,
-    steps: Steps,
-) -> Path:
-    """The component grid of one level on every node of the lattice, halo included."""
-    params: dict[str, Any] = {
-        "height_m": height - survey.height_m,
-        "allow_downward_continuation": wanted.allow_downward_continuation,
-        **node_axes(lattice),
-    }
-    for angle in ("inclination_deg", "declination_deg"):
-        if (value := getattr(wanted, angle)) is not None:
-            params[angle] = value
-    out = folder / f"level-{height:.12g}m.nc"
-    return steps.run(components.STAGE, {"grid": survey.grid}, out, params)
+class Levels:
+    """Makes the component grids of levels, on every node of a lattice with its halo."""
+
+    def __init__(
+        self, wanted: AnomalyTable, survey: Survey, lattice: Lattice, folder: Path, steps: Steps
+    ) -> None:
+        self._wanted, self._survey, self._lattice = wanted, survey, lattice
+        self._folder, self._steps = folder, steps
+        self._begun: dict[float, LevelTasks] = {}
+        self._tasks = Tasks()
+
+    @property
+    def are_large(self) -> bool:
+        """Whether they are made block by block."""
+        return self._job(self._survey.height_m).is_large
+
+    def begin(self, tasks: Tasks, heights: Sequence[float]) -> None:
+        """Ask for the blocks of all levels, lowest first: none waits while one is put together."""
+        self._tasks = tasks
+        self._begun = {height: begin(tasks, self._job(height)) for height in heights}
+
+    def make(self, height: float) -> Path:
+        """The level of one height."""
+        job = self._job(height)
+        if height not in self._begun:
+            return self._steps.run(
+                components.STAGE, {"grid": job.grid}, job.out, self._params(height)
+            )
+        self._steps.report(components.STAGE.name)
+        begun = self._begun.pop(height)
+        tell = self._steps.within(f"blocks of {job.out.stem}")
+        self._tasks.results(begun.tasks, lambda done: tell(done, len(begun.tasks)))
+        return finish(begun)
+
+    def _job(self, height: float) -> LevelJob:
+        out = self._folder / f"level-{height:.12g}m.nc"
+        return LevelJob.of(self._survey.grid, self._params(height), out)
+
+    def _params(self, height: float) -> dict[str, Any]:
+        params: dict[str, Any] = {
+            "height_m": height - self._survey.height_m,
+            "allow_downward_continuation": self._wanted.allow_downward_continuation,
+            **node_axes(self._lattice),
+        }
+        for name in ("inclination_deg", "declination_deg", "block_nodes"):
+            if (value := getattr(self._wanted, name)) is not None:
+                params[name] = value
+        return params

@@ -32,6 +32,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DATA_DIR",
         help="where the files of sources lie (default: beside each source TOML)",
     )
+    parser.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="dask scheduler to work with, such as tcp://host:8786, whose workers see the folder "
+        "--work (default: a cluster on this machine, where that pays)",
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -46,6 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
             work=arguments.work,
             data=arguments.data,
             progress=progress,
+            scheduler=arguments.scheduler,
         )
     if arguments.json:
         print_json(result)

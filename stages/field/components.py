@@ -11,7 +11,7 @@ from magtiles.stages.declare import Params, Stage, quantity
 from magtiles.stages.field.at_nodes import evaluate_products, quality_flags
 from magtiles.stages.field.blocks import Block
 from magtiles.stages.field.direction import Ambient, AmbientSource
-from magtiles.stages.field.large import BLOCK_NODES, LargeLevel, is_large, strips
+from magtiles.stages.field.large import LargeLevel, is_large, strips
 from magtiles.stages.field.level import assemble_level, mean_angles, wgs84_variable
 from magtiles.stages.field.padding import plan_padding
 from magtiles.stages.field.prepare import prepare
@@ -56,8 +56,8 @@ class DeriveComponentsParams(Params):
         "1",
         default=None,
         ge=128,
-        doc="Transform in blocks of so many nodes a side; default one transform of up to "
-        f"4096 x 4096 nodes, and blocks of {BLOCK_NODES} of larger maps.",
+        doc="Transform in blocks of so many nodes a side; default blocks of 2048 where the grid "
+        "has more than 4096 x 4096 nodes, or the output twice that.",
     )
 
 
@@ -109,14 +109,13 @@ def makes_blocks(grid: xr.Dataset, params: DeriveComponentsParams) -> bool:
 
 
 def large_level(
-    grid: xr.Dataset, params: DeriveComponentsParams, whole: xr.Dataset | None = None
+    grid: xr.Dataset, params: DeriveComponentsParams, known: tuple[float, float] | None = None
 ) -> LargeLevel:
-    """The blocks of a level; with `whole`, that level's survey, the map itself is not read.
+    """The blocks of a level; where mean and sigma of the map are `known`, it is not read for them.
 
     Raises as `derive_components`.
     """
     _permit(grid, params)
-    known = None if whole is None else (float(whole.attrs["mean"]), float(whole.attrs["sigma"]))
     windows = MapWindows.of(grid, known)
     ambient = AmbientSource(grid, params.inclination_deg, params.declination_deg)
     if params.latitude is not None and params.longitude is not None:
@@ -205,7 +204,7 @@ def _assemble(
 
 STAGE = Stage(
     name="derive-components",
-    version=1,
+    version=2,
     params=DeriveComponentsParams,
     inputs={"grid": "anomaly-grid/1"},
     output="component-grid/1",

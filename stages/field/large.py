@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -87,7 +87,7 @@ class LargeLevel:
 
 
 def strips(
-    blocks: list[list[Block]], name: str, read: Callable[[Block], NDArray[Any]]
+    blocks: Sequence[Sequence[Block]], name: str, read: Callable[[Block], NDArray[Any]]
 ) -> Iterator[tuple[Span, NDArray[Any]]]:
     """A variable of a level, in strips of rows from south to north, from that of its blocks.
 

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import numba
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
@@ -37,8 +38,11 @@ _MANY = 1 << 18
 
 
 def _workers(size: int) -> int:
-    """Threads for a transform of so many numbers: starting them for a small one costs more."""
-    return -1 if size > _MANY else 1
+    """Threads for a transform of so many numbers: starting them for a small one costs more.
+
+    As many as compiled loops may have, so that one knob serves both.
+    """
+    return int(numba.get_num_threads()) if size > _MANY else 1
 
 
 @dataclass(frozen=True)

@@ -195,7 +195,7 @@ def test_build_passes_its_folders_on_and_says_what_it_did(
         return PublishResult(Path("store/p/1.0.0"), changed=len(asked) == 1)
 
     monkeypatch.setattr(build, "build_product", build_product)
-    argv = ["build", "p.toml", "--store", "store", "--from", "data"]
+    argv = ["build", "p.toml", "--store", "store", "--from", "data", "--scheduler", "tcp://h:1"]
     assert main(argv) == 0
     assert "store/p/1.0.0: published" in capsys.readouterr().out
     assert main(argv) == 0
@@ -209,6 +209,7 @@ def test_build_passes_its_folders_on_and_says_what_it_did(
         "store": Path("store"),
         "work": Path("build/work"),
         "data": Path("data"),
+        "scheduler": "tcp://h:1",
     }
 
 

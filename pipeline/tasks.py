@@ -1,0 +1,232 @@
+"""Work that can be done side by side: here, by a local cluster, or by one that is already there."""
+
+from __future__ import annotations
+
+import concurrent.futures
+import contextlib
+import importlib.metadata
+import logging
+import secrets
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+from magtiles.pipeline import receipts
+from magtiles.schemas.errors import MagtilesError, UsageError
+
+if TYPE_CHECKING:
+    import distributed
+
+Value = TypeVar("Value")
+
+_WORKER_BYTES = 2 << 30
+"""Memory that one worker may need: a block of a large map, with what Python itself takes."""
+_PATIENCE_S = 30
+
+
+@dataclass
+class Task(Generic[Value]):
+    """Work that was asked for; done in a cluster, or here when its result is asked for."""
+
+    work: Callable[[], Value]
+    future: Any = None
+    _done: list[Value] = field(default_factory=list)
+
+    def result(self) -> Value:
+        """What the work gave, or raises what it raised."""
+        if not self._done:
+            self._done.append(self.work() if self.future is None else _result(self.future))
+        return self._done[0]
+
+
+class Tasks:
+    """Where work is done: in a cluster once there is one, in this process until then."""
+
+    def __init__(self) -> None:
+        self._starting: concurrent.futures.Future[distributed.Client] | None = None
+
+    def use(self, starting: concurrent.futures.Future[distributed.Client]) -> None:
+        """Do what is submitted from now on in the cluster that is being started."""
+        self._starting = starting
+
+    @property
+    def in_cluster(self) -> bool:
+        """Whether there is a cluster."""
+        return self._starting is not None
+
+    def submit(
+        self, function: Callable[..., Value], *arguments: Any, after: Sequence[Task[Any]] = ()
+    ) -> Task[Value]:
+        """Ask for a call of a function of a module, once the tasks `after` are done."""
+        if self._starting is None:
+            return Task(lambda: function(*arguments))
+        client, waited = self._starting.result(), [task.future for task in after]
+        key = f"{function.__name__.strip('_')}-{secrets.token_hex(8)}"
+        return Task(
+            lambda: function(*arguments),
+            client.submit(_alone, function, arguments, waited, key=key, pure=False),
+        )
+
+    def results(self, tasks: Sequence[Task[Value]], done: Callable[[int], None]) -> list[Value]:
+        """Results in order of the tasks; `done` is told how many there are so far.
+
+        Raises what the first task to fail raised.
+        """
+        if self._starting is None:
+            return [_counted(task, done, n) for n, task in enumerate(tasks, 1)]
+        import distributed
+
+        loop = self._starting.result().loop
+        finished = distributed.as_completed([task.future for task in tasks], loop=loop)
+        for n, future in enumerate(finished, 1):
+            if future.status != "finished":
+                _result(future)
+            done(n)
+        return [task.result() for task in tasks]
+
+
+def _counted(task: Task[Value], done: Callable[[int], None], number: int) -> Value:
+    value = task.result()
+    done(number)
+    return value
+
+
+@contextlib.contextmanager
+def working(scheduler: str | None, shared: Path) -> Iterator[Workplace]:
+    """Tasks, in the cluster at address `scheduler`, or in this process until more is asked for.
+
+    The cluster must see the folder `shared` and run this very code in workers of one thread:
+    MagtilesError if not, UsageError where there is none at the address.
+    """
+    with contextlib.ExitStack() as opened, concurrent.futures.ThreadPoolExecutor(1) as starter:
+        place = Workplace(Tasks(), opened, starter)
+        if scheduler is not None:
+            client = opened.enter_context(_connected(scheduler))
+            _check_workers(client, shared)
+            there: concurrent.futures.Future[distributed.Client] = concurrent.futures.Future()
+            there.set_result(client)
+            place.tasks.use(there)
+        yield place
+
+
+@dataclass(frozen=True)
+class Workplace:
+    """Tasks, and what it takes to give them a local cluster."""
+
+    tasks: Tasks
+    _opened: contextlib.ExitStack
+    _starter: concurrent.futures.Executor
+
+    def expand(self) -> None:
+        """Have a local cluster, of a process per core, unless there is one; it starts meanwhile."""
+        if not self.tasks.in_cluster:
+            cluster = _local_cluster()
+            self.tasks.use(self._starter.submit(self._opened.enter_context, cluster))
+
+
+@contextlib.contextmanager
+def _local_cluster() -> Iterator[distributed.Client]:
+    """A process per core, as far as memory goes round; a process that dies is replaced."""
+    import distributed
+    from dask.system import CPU_COUNT
+    from distributed.system import MEMORY_LIMIT
+
+    count = max(1, min(CPU_COUNT, MEMORY_LIMIT // _WORKER_BYTES))
+    with (
+        distributed.LocalCluster(
+            n_workers=count,
+            threads_per_worker=1,
+            dashboard_address="127.0.0.1:0",
+            memory_limit=0,
+            silence_logs=logging.CRITICAL,
+        ) as cluster,
+        contextlib.closing(distributed.Client(cluster, set_as_default=False)) as client,
+    ):
+        yield client
+
+
+@contextlib.contextmanager
+def _connected(scheduler: str) -> Iterator[distributed.Client]:
+    import distributed
+
+    try:
+        client = distributed.Client(scheduler, timeout=_PATIENCE_S, set_as_default=False)
+        client.wait_for_workers(1, timeout=_PATIENCE_S)
+    except (OSError, TimeoutError, ValueError) as caught:
+        raise UsageError(
+            f"no scheduler with workers answers ({str(caught) or type(caught).__name__})",
+            where=f"--scheduler {scheduler}",
+            expected="an address such as tcp://host:8786",
+            remedy="start dask scheduler and dask worker --nthreads 1 there",
+        ) from caught
+    with contextlib.closing(client):
+        yield client
+
+
+def _check_workers(client: distributed.Client, shared: Path) -> None:
+    """Raise MagtilesError unless every worker can do our work as we would."""
+    for address, worker in client.scheduler_info(n_workers=-1)["workers"].items():
+        if worker["nthreads"] != 1:
+            raise MagtilesError(
+                f"the worker has {worker['nthreads']} threads",
+                where=address,
+                expected="one: netCDF is not safe in several",
+                remedy="start it with --nthreads 1",
+            )
+    try:
+        client.run(importlib.metadata.version, "magtiles")
+    except importlib.metadata.PackageNotFoundError as caught:
+        raise MagtilesError(
+            "a worker has no magtiles", where=client.scheduler.address, remedy="install it there"
+        ) from caught
+    shared.mkdir(parents=True, exist_ok=True)
+    token = shared.absolute() / f".shared-{secrets.token_hex(8)}.tmp"
+    token.write_text(token.name, encoding="utf-8")
+    try:
+        found = client.run(_describe_worker, token)
+    finally:
+        token.unlink(missing_ok=True)
+    ours = (token.name, receipts.code_digest(), receipts.package_versions())
+    names = ("the folder of this build", "this version of magtiles", "these versions of libraries")
+    for address, theirs in found.items():
+        for name, own, its in zip(names, ours, theirs, strict=True):
+            if own != its:
+                raise MagtilesError(
+                    f"the worker has not {name}",
+                    where=address,
+                    expected=str(shared.absolute()) if own == token.name else str(own),
+                    remedy="give it the same file system and the same environment",
+                )
+
+
+def _describe_worker(token: Path) -> tuple[str, str, dict[str, str]]:
+    try:
+        seen = token.read_text(encoding="utf-8")
+    except OSError:
+        seen = ""
+    return seen, receipts.code_digest(), receipts.package_versions()
+
+
+def _alone(function: Callable[..., Value], arguments: Sequence[Any], after: Sequence[Any]) -> Value:
+    """Run in a worker, which has its core for itself and no more: `after` only makes it wait."""
+    import numba
+
+    numba.set_num_threads(1)
+    return function(*arguments)
+
+
+def _result(future: Any) -> Any:
+    import distributed
+
+    try:
+        return future.result()
+    except distributed.KilledWorker as caught:
+        raise MagtilesError(
+            f"workers died again and again ({caught})",
+            remedy="check memory; a script that builds must do so below if __name__ == '__main__':",
+        ) from caught
+    except concurrent.futures.CancelledError as caught:
+        raise MagtilesError(
+            "the work was cancelled", remedy="check that the scheduler still runs"
+        ) from caught
