@@ -31,6 +31,9 @@ class RoadsTable(Params):
     logs: Annotated[dict[str, tuple[str, ...]], pydantic.AfterValidator(_named)] = quantity(
         "1", doc="By vehicle: source TOMLs of its drives. The first lays down the points."
     )
+    maps: tuple[str, ...] = quantity(
+        "1", default=(), doc="Maps of earlier releases that the drives are added to, with no logs."
+    )
     calibration: dict[str, str] = quantity(
         "1", default={}, doc="By vehicle: source TOML of the drive that calibrates it."
     )
@@ -60,6 +63,7 @@ class RoadSources:
     """What a [[roads]] table asks for, its logs found and read, by vehicle."""
 
     table: RoadsTable
+    maps: Sequence[Path]
     logs: Mapping[str, Sequence[Source[Any]]]
     calibration: Mapping[str, Source[Any]]
 
@@ -108,7 +112,20 @@ def _load(table: RoadsTable, product: Path, key: str) -> RoadSources:
         vehicle: load_source(find_source(name, product, f"{key}.calibration.{vehicle}"), TRACK)
         for vehicle, name in table.calibration.items()
     }
-    return RoadSources(table, logs, calibration)
+    return RoadSources(table, _earlier(table, product, key), logs, calibration)
+
+
+def _earlier(table: RoadsTable, product: Path, key: str) -> list[Path]:
+    """Paths of the maps that the drives are added to."""
+    found = [product.parent / name for name in table.maps]
+    for path in found:
+        if not path.is_file():
+            raise SourceError(
+                f"map '{path}' does not exist",
+                where=f"{product} {key}.maps",
+                expected="a file of roads/ in an earlier release, by its path from the product",
+            )
+    return found
 
 
 def _check_calibration(table: RoadsTable, product: Path, key: str) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 
 import xarray as xr
 
+from magtiles.pipeline import receipts
 from magtiles.pipeline.artifacts import open_artifact
 from magtiles.pipeline.plotting import save_png
 from magtiles.pipeline.road_plots import KINDS, road_figure
@@ -134,7 +135,9 @@ def _maps(roads: RoadSources, tracks: _Tracks) -> Iterator[Path]:
         for vehicle, logs in roads.logs.items()
         for log in logs
     ]
-    for road in _roads_of(drives[0].track, table):
+    for earlier in roads.maps:
+        yield _updated(earlier, drives, table, tracks)
+    for road in _roads_of(drives[0].track, table) if not roads.maps else ():
         base = _pass(drives[0], road, None, "forward", table, tracks)
         for way in road.directions:
             tracks.expect(len(drives) + 2)
@@ -149,6 +152,20 @@ def _maps(roads: RoadSources, tracks: _Tracks) -> Iterator[Path]:
             if len(passes) > 1:
                 whole = tracks.run(merge.STAGE, {"passes": passes}, f"{stem}-merged", {})
             yield tracks.run(features.STAGE, {"road": whole}, f"{stem}-features", {})
+
+
+def _updated(earlier: Path, drives: Sequence[_Drive], table: RoadsTable, tracks: _Tracks) -> Path:
+    """An earlier map with the drives added to it; the drives that made it are not needed."""
+    with open_artifact(earlier) as opened:
+        way, name = str(opened.attrs["direction"]), str(opened.attrs["road"])
+        table = table.model_copy(update={"spacing_m": float(opened.attrs["spacing_m"])})
+    tracks.expect(len(drives) + 2)
+    road = _Road(name, None, (way,))
+    passes = [_pass(drive, road, earlier, way, table, tracks) for drive in drives]
+    stem = f"{name}-{way}"
+    merged = {"passes": passes, "road": earlier}
+    whole = tracks.run(merge.STAGE, merged, f"{stem}-merged", {})
+    return tracks.run(features.STAGE, {"road": whole}, f"{stem}-features", {})
 
 
 def _pass(
@@ -214,6 +231,12 @@ def _told_apart(roads: Sequence[xr.Dataset]) -> list[xr.Dataset]:
 def _inputs(wanted: Sequence[RoadSources], data: Path | None) -> Iterator[dict[str, str]]:
     """Of the manifest: each log once, as a road's, else as a calibration."""
     listed: set[str] = set()
+    for path in (path for w in wanted for path in w.maps):
+        licences = sorted({s.source.licence for w in wanted for s in w.sources})
+        yield {
+            "id": f"map {path.stem}", "sha256": receipts.digest(path),
+            "licence": " and ".join(licences), "role": "road map",
+        }  # fmt: skip
     by_role = [("road", [s for w in wanted for logs in w.logs.values() for s in logs])]
     by_role.append(("calibration", [s for w in wanted for s in w.calibration.values()]))
     for role, sources in by_role:

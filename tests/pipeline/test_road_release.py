@@ -135,6 +135,31 @@ def test_what_another_pass_measured_is_found(release: Release, built: Built) -> 
     assert found.distance == pytest.approx(975.0, abs=3.0)
 
 
+def test_a_new_pass_makes_a_new_version_without_the_old_logs(built: Built) -> None:
+    write_drive(built.inputs, LOOP, SUV, 2)
+    earlier = "../store/demo/1.0.0/roads/loop.nc"
+    roads = (
+        f'[[roads]]\nname = "loop"\nmaps = ["{earlier}"]\nlogs = {{suv = ["suv-loop-2.toml"]}}\n'
+        'calibration = {suv = "suv-calibration-1.toml"}\nattitude_lag_s = 0.0\nfix_lag_s = 0.0\n'
+    )
+    product = built.inputs / "demo.toml"
+    text = product.read_text()
+    product.write_text(text.split("[[roads]]")[0].replace("1.0.0", "1.1.0") + roads)
+    try:
+        assert built.build() == 0
+    finally:
+        product.write_text(text)
+    old, new = (open_release(built.store / "demo" / v) for v in ("1.0.0", "1.1.0"))
+    before, after = old.roads["loop"].variables, new.roads["loop"].variables
+    assert after["pass_name"].tolist() == [*before["pass_name"].tolist(), "suv-loop-2"]
+    np.testing.assert_array_equal(after["distance"], before["distance"])
+    assert after["passes"].max() == before["passes"].max() + 1
+    inputs = {record.id for record in new.manifest.inputs}
+    assert "map loop" in inputs
+    assert not any(name.startswith(("car-loop", "suv-loop-1")) for name in inputs)
+    assert all(check.passed for check in validate_release(new.path))
+
+
 def test_uncalibrated_maps_say_so(release: Release) -> None:
     flags = release.roads["out"].variables["quality_flag"]
     assert ((flags & int(RoadFlag.UNCALIBRATED)) != 0).all()
@@ -263,6 +288,11 @@ BAD = [
         "unknown key",
         lambda t: t.replace("spacing_m = 3.0", "spacing = 3.0"),
         r"unknown key 'roads\[1\].spacing'; expected one of attitude_lag_s",
+    ),
+    Bad(
+        "no map",
+        lambda t: t.replace("spacing_m = 3.0", 'maps = ["gone.nc"]'),
+        r"roads\[1\].maps: map '.*gone.nc' does not exist",
     ),
     Bad("no logs", lambda t: t.replace("logs = {truck", "log = {truck"), r"'roads\[1\].log'"),
     Bad(
