@@ -1,0 +1,224 @@
+"""Maps of any size: blocks against one transform, memory and time by size, one worker and two.
+
+``bench_blocks.py`` does all; name parts of it (``compare``, ``sizes``, ``workers``) to do those.
+A map of 3000 x 3000 nodes, with a void and a coast, is made at once and in blocks, and compared
+everywhere. Builds of 1024 to 8192 nodes a side, five levels each, run in processes of their
+own; what they hold in memory is what no other process shares with them, workers included.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import bench_chain
+import distributed
+import numpy as np
+import psutil
+import pyproj
+import scipy.fft
+import xarray as xr
+
+from magtiles.pipeline.build import build_product
+from magtiles.stages.field.components import DeriveComponentsParams, derive_components
+from magtiles.stages.field.level import PRODUCTS, SIGMAS
+from magtiles.stages.field.voids import FillVoidsParams, fill_voids
+
+COMPARED, SPACING_M = 3000, 250.0
+GAINS_M = (0.0, 500.0, 2000.0)
+LOW = {"inclination_deg": 8.0, "declination_deg": 37.0}
+SIZES = (1024, 2048, 4096, 8192)
+LEVELS_M = (800.0, 1300.0, 2300.0, 4300.0)
+WORKERS_SIZE, WORKERS_BLOCK = 3000, 1024
+
+
+def example() -> xr.Dataset:
+    """Noise as red as a crust's, 100 nT, and 1 nT of white noise; a void and a ragged border."""
+    rng = np.random.default_rng(11)
+    shape = (COMPARED, COMPARED)
+    full = COMPARED + 600
+    k = np.hypot(np.fft.fftfreq(full)[:, None], np.fft.rfftfreq(full))
+    k[0, 0] = np.inf
+    spectrum = scipy.fft.rfft2(rng.standard_normal((full, full))) * k**-1.3 * np.exp(-25.0 * k)
+    values = scipy.fft.irfft2(np.nan_to_num(spectrum), s=(full, full))[:COMPARED, :COMPARED]
+    values = 30.0 + 100.0 * values / values.std() + rng.standard_normal(shape)
+    i, j = np.mgrid[:COMPARED, :COMPARED]
+    values[(i - 1024) ** 2 + (j - 1500) ** 2 / 2 < 60**2] = np.nan
+    values[j < 40 + 30 * np.sin(i / 50)] = np.nan
+    axis = SPACING_M * (np.arange(COMPARED) - COMPARED / 2)
+    metres = {"units": "m"}
+    crs = pyproj.CRS(proj="tmerc", lat_0=46, lon_0=-120, datum="WGS84")
+    grid = xr.Dataset(
+        {
+            "magnetic_anomaly": (("y", "x"), values, {"units": "nT", "grid_mapping": "crs"}),
+            "magnetic_anomaly_uncertainty": ((), 1.0, {"units": "nT"}),
+            "height": ((), 300.0, metres),
+            "crs": ((), np.int32(0), crs.to_cf()),
+        },
+        coords={"y": ("y", axis, metres), "x": ("x", axis, metres)},
+        attrs={
+            "reference_field": "IGRF-14",
+            "reference_epoch": "2010-01-01",
+            "anomaly_definition": "total-field anomaly",
+            "height_reference": "ellipsoid",
+            "source": "benchmark",
+        },
+    )
+    return fill_voids(grid, params=FillVoidsParams())
+
+
+def compare() -> None:
+    """Greatest difference of blocks from one transform, everywhere, in sigma as that states it."""
+    grid = example()
+    print(f"map {COMPARED} x {COMPARED}: one transform, and blocks; greatest difference in sigma")
+    for name, angles in (("IGRF", {}), ("inclination 8, declination 37", LOW)):
+        print(name)
+        for gain in GAINS_M:
+            one = derive_components(grid, params=DeriveComponentsParams(height_m=gain, **angles))
+            params = DeriveComponentsParams(height_m=gain, block_nodes=1024, **angles)
+            report(gain, one, derive_components(grid, params=params))
+
+
+def report(gain: float, one: xr.Dataset, blocked: xr.Dataset) -> None:
+    """Print one height's differences: of values, of splines' gradients, of sigma and flags."""
+    found = {"total": 0.0, "vector": 0.0, "tensor": 0.0, "slope": 0.0}
+    per_node = one["tensor_uncertainty"].values / 1000.0 * SPACING_M
+    for name in PRODUCTS:
+        group = {"magnetic": "total", "anomaly": "vector"}.get(name.split("_")[0], "tensor")
+        sigma = next(n for n, g in SIGMAS.items() if g == group)
+        error = blocked[name].values - one[name].values
+        found[group] = max(found[group], float(np.abs(error / one[sigma].values).max()))
+        if group != "tensor":
+            for axis in (0, 1):
+                slope = np.abs(np.diff(error, axis=axis)) / np.delete(per_node, -1, axis)
+                found["slope"] = max(found["slope"], float(slope.max()))
+    ratios = [(blocked[n] / one[n]).values for n in SIGMAS]
+    flags = int((blocked["quality_flag"].values != one["quality_flag"].values).sum())
+    print(
+        f"  {gain:6.0f} m up: " + ", ".join(f"{k} {v:.4f}" for k, v in found.items()),
+        f"(asked: at most 0.1); sigma x {min(r.min() for r in ratios):.3f} to "
+        f"{max(r.max() for r in ratios):.3f}; {flags} flags differ",
+        flush=True,
+    )
+
+
+def sizes() -> None:
+    """Time and memory of builds by size."""
+    print(f"builds of {1 + len(LEVELS_M)} levels")
+    first = None
+    for size in SIZES:
+        made = in_process(size, None, None)
+        cell = made["seconds"] / size**2
+        first = first or cell
+        print(
+            f"  {size:5} a side: {made['seconds']:7.1f} s, {1e6 * cell:6.2f} us a cell "
+            f"({cell / first:.2f} of the first; asked: 0.8 to 1.2), at most "
+            f"{made['whole_gb']:.2f} GB, {made['own_gb']:.2f} in the build's own process and "
+            f"{made['worker_gb']:.2f} in a worker (asked at 4096: below 4)",
+            {step: round(seconds, 1) for step, seconds in made["steps"].items()},
+            flush=True,
+        )
+
+
+def workers() -> None:
+    """Time of one build in blocks by one worker, and by two."""
+    seconds = {}
+    for count in (1, 2):
+        with distributed.LocalCluster(
+            n_workers=count, threads_per_worker=1, dashboard_address="127.0.0.1:0", memory_limit=0
+        ) as cluster:
+            made = in_process(WORKERS_SIZE, WORKERS_BLOCK, cluster.scheduler_address)
+        seconds[count] = made["steps"]["derive-components"] + made["steps"]["cutting tiles"]
+        print(f"  {count} workers: {made['seconds']:.1f} s, tasks {seconds[count]:.1f} s")
+    print(f"two workers are {seconds[1] / seconds[2]:.2f} times as fast (asked: at least 1.6)")
+
+
+def in_process(size: int, block: int | None, scheduler: str | None) -> dict[str, Any]:
+    """What `build` prints, in a process of its own."""
+    command = [sys.executable, __file__, "build", json.dumps([size, block, scheduler])]
+    printed = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
+    made: dict[str, Any] = json.loads(printed.splitlines()[-1])
+    return made
+
+
+def build(size: int, block: int | None, scheduler: str | None) -> None:
+    """Build a map of that size and print, as JSON, what it took."""
+    bench_chain.SIZE = size
+    steps: dict[str, float] = {}
+    last: list[Any] = [0.0, "start"]
+
+    def progress(what: str, done: int, total: int) -> None:
+        now = time.perf_counter()
+        what = "derive-components" if what.startswith("blocks of") else what
+        steps[last[1]] = steps.get(last[1], 0.0) + now - last[0]
+        last[:] = now, what
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        product = bench_chain.write_inputs(folder)
+        text = product.read_text().replace(str(list(bench_chain.LEVELS_M)), str(list(LEVELS_M)))
+        product.write_text(text + (f"block_nodes = {block}\n" if block else ""))
+        with Watch() as memory:
+            start = last[0] = time.perf_counter()
+            result = build_product(
+                product,
+                store=folder / "store",
+                work=folder / "work",
+                progress=progress,
+                scheduler=scheduler,
+            )
+            seconds = time.perf_counter() - start
+        progress("end", 1, 1)
+        # What was published is read-only, to the folder's own removal too.
+        for part in [result.path, *result.path.rglob("*")]:
+            part.chmod(0o755)
+    print(json.dumps({"seconds": seconds, "steps": steps, **memory.gigabytes}))
+
+
+class Watch:
+    """The most memory that this process and its children hold for themselves, meanwhile."""
+
+    def __init__(self) -> None:
+        self.gigabytes = {"whole_gb": 0.0, "own_gb": 0.0, "worker_gb": 0.0}
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._look)
+
+    def __enter__(self) -> Watch:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._thread.join()
+
+    def _look(self) -> None:
+        me = psutil.Process()
+        while not self._over.wait(0.2):
+            try:
+                own = me.memory_full_info().uss / 1e9
+                others = [c.memory_full_info().uss / 1e9 for c in me.children(recursive=True)]
+            except psutil.Error:  # a child that has just ended
+                continue
+            seen = own + sum(others), own, max(others, default=0.0)
+            for name, value in zip(self.gigabytes, seen, strict=True):
+                self.gigabytes[name] = max(self.gigabytes[name], value)
+
+
+def main() -> None:
+    """Do all parts, or those named."""
+    if sys.argv[1:2] == ["build"]:
+        build(*json.loads(sys.argv[2]))
+        return
+    parts = {"compare": compare, "sizes": sizes, "workers": workers}
+    for name in sys.argv[1:] or parts:
+        parts[name]()
+
+
+if __name__ == "__main__":
+    main()
