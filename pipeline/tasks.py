@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import concurrent.futures
 import contextlib
+import gc
 import importlib.metadata
 import logging
 import secrets
@@ -80,6 +81,7 @@ class Tasks:
         loop = self._starting.result().loop
         finished = distributed.as_completed([task.future for task in tasks], loop=loop)
         for n, future in enumerate(finished, 1):
+            gc.collect(1)  # the young: of what is old there is little
             if future.status != "finished":
                 _result(future)
             done(n)
@@ -102,6 +104,7 @@ def working(scheduler: str | None, shared: Path) -> Iterator[Workplace]:
     with contextlib.ExitStack() as opened, concurrent.futures.ThreadPoolExecutor(1) as starter:
         place = Workplace(Tasks(), opened, starter)
         if scheduler is not None:
+            opened.enter_context(_garbage_collected_here())
             client = opened.enter_context(_connected(scheduler))
             _check_workers(client, shared)
             there: concurrent.futures.Future[distributed.Client] = concurrent.futures.Future()
@@ -121,8 +124,25 @@ class Workplace:
     def expand(self) -> None:
         """Have a local cluster, of a process per core, unless there is one; it starts meanwhile."""
         if not self.tasks.in_cluster:
+            self._opened.enter_context(_garbage_collected_here())
             cluster = _local_cluster()
             self.tasks.use(self._starter.submit(self._opened.enter_context, cluster))
+
+
+@contextlib.contextmanager
+def _garbage_collected_here() -> Iterator[None]:
+    """Garbage is collected by this thread alone, in `Tasks.results`.
+
+    A thread of the cluster would close netCDF files that it finds there, and crash the process
+    where this one is inside HDF5, which is not safe in several threads.
+    """
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 @contextlib.contextmanager

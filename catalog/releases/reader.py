@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Iterator
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 from magtiles.catalog.releases.expected import ReleaseAnomaly, core_field
@@ -37,13 +37,15 @@ class Release:
     ) -> None:
         self.path = path
         self.manifest = manifest
+        # Not the bound method: in a cycle, tiles would be closed by whichever thread collects it.
+        self._read = partial(_read_file, path, manifest)
         self._extrapolate = allow_extrapolated
         self._store = TileStore(path, manifest, cache_bytes)
 
     @cached_property
     def anomaly(self) -> ReleaseAnomaly:
         """Queries of the anomaly, and of the whole field that is expected with it."""
-        return ReleaseAnomaly(self.manifest, self._store, self._extrapolate, self.file)
+        return ReleaseAnomaly(self.manifest, self._store, self._extrapolate, self._read)
 
     @cached_property
     def temporal(self) -> TemporalModel:
@@ -55,11 +57,10 @@ class Release:
         record = self.manifest.temporal
         if record is None:
             raise self._lacks("temporal model")
-        with self._store.lock:
-            data = read_temporal(self.file(record.path), self.path / record.path)
+        manifest, read = self.manifest, self._read
         return TemporalModel(
-            data,
-            lambda: core_field(self.manifest, self.file),
+            read_temporal(read(record.path), self.path / record.path),
+            lambda: core_field(manifest, read),
             f"release {self.manifest.product} {self.manifest.version}",
             allow_extrapolated=self._extrapolate,
         )
@@ -72,7 +73,7 @@ class Release:
         """
         if not self.manifest.roads:
             raise self._lacks("road maps")
-        return Roads(self.path, self.manifest, self.file, self._store.lock)
+        return Roads(self.path, self.manifest, self._read)
 
     def tiles(self) -> Iterator[TileData]:
         """Every tile, whole: size, sha256, contract and lattice verified. IntegrityError."""
@@ -80,10 +81,7 @@ class Release:
 
     def file(self, path: str) -> bytes:
         """The verified bytes of one file of the release, by its path in the manifest."""
-        for record in self.manifest.files:
-            if record.path == path:
-                return read_verified(self.path / path, size=record.size, digest=record.sha256)
-        raise IntegrityError("is not part of the release", where=self.path / path)
+        return self._read(path)
 
     def __repr__(self) -> str:
         return f"<Release {self.manifest.product} {self.manifest.version} at {self.path}>"
@@ -92,6 +90,13 @@ class Release:
         return QueryError(
             f"has no {what}", where=f"release {self.manifest.product} {self.manifest.version}"
         )
+
+
+def _read_file(folder: Path, manifest: Manifest, path: str) -> bytes:
+    for record in manifest.files:
+        if record.path == path:
+            return read_verified(folder / path, size=record.size, digest=record.sha256)
+    raise IntegrityError("is not part of the release", where=folder / path)
 
 
 def open_release(

@@ -10,6 +10,7 @@ import netCDF4
 import numpy as np
 from numpy.typing import NDArray
 
+from magtiles.catalog.releases.hdf5 import LOCK
 from magtiles.schemas.errors import IntegrityError
 
 NANOSECONDS = "nanoseconds since 1970-01-01"
@@ -71,7 +72,7 @@ def read_record(
     `wanted` gives the variables that belong with those that are present.
     """
     try:
-        with netCDF4.Dataset(table.file, memory=data) as file:
+        with LOCK, netCDF4.Dataset(table.file, memory=data) as file:
             file.set_auto_maskandscale(False)
             _check_structure(file, where, table, wanted, len(data))
             variables = {name: _read(variable) for name, variable in file.variables.items()}

@@ -25,14 +25,9 @@ class Roads(Mapping[str, Road]):
     Another name raises QueryError, a file that is not what the manifest says IntegrityError.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        manifest: Manifest,
-        read: Callable[[str], bytes],
-        lock: threading.RLock,
-    ) -> None:
-        self._folder, self._manifest, self._read, self._lock = folder, manifest, read, lock
+    def __init__(self, folder: Path, manifest: Manifest, read: Callable[[str], bytes]) -> None:
+        self._folder, self._manifest, self._read = folder, manifest, read
+        self._lock = threading.RLock()
         self._open: dict[str, Road] = {}
 
     def __getitem__(self, name: str) -> Road:

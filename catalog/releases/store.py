@@ -36,10 +36,7 @@ def _open(folder: Path, record: TileRecord, manifest: Manifest) -> Tile:
 
 
 class TileStore:
-    """Least recently used tiles are dropped when the cache exceeds `cache_bytes`.
-
-    `lock` is held while a file of the release is open: HDF5 is not thread-safe.
-    """
+    """Least recently used tiles are dropped when the cache exceeds `cache_bytes`."""
 
     block_cells = BLOCK
     spline = staticmethod(evaluate)
@@ -49,24 +46,24 @@ class TileStore:
         self._manifest = manifest
         self._cache_bytes = cache_bytes
         self._tiles: OrderedDict[tuple[int, int], Tile] = OrderedDict()
-        self.lock = threading.RLock()
+        self._lock = threading.RLock()
 
     def coefficients(
         self, place: tuple[int, int], family: str, level: int, block: tuple[int, int]
     ) -> tuple[Floats, tuple[int, int]]:
         """`Tile.coefficients` of the tile at `place`."""
-        with self.lock:
+        with self._lock:
             return self._tile(place).coefficients(family, level, block)
 
     def plane(self, place: tuple[int, int], name: str, level: int = 0) -> NDArray[Any]:
         """`Tile.plane` of the tile at `place`."""
-        with self.lock:
+        with self._lock:
             return self._tile(place).plane(name, level)
 
     def read_all(self) -> Iterator[TileData]:
         """Every tile, whole and verified, from the south-west by rows; none is cached."""
         for place in sorted(self._manifest.tiles):
-            with self.lock:
+            with self._lock:
                 data = read_tile(self._folder, self._manifest.tiles[place], self._manifest)
             yield data
 

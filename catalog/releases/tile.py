@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from magtiles.catalog.kernels.bspline import HALO, Floats, prefilter
 from magtiles.catalog.kernels.geodesy import metres_per_degree
 from magtiles.catalog.kernels.vertical import AMBIENT, hermite_planes, required_variables
+from magtiles.catalog.releases.hdf5 import LOCK
 from magtiles.catalog.releases.manifest import Manifest, TileRecord
 from magtiles.catalog.releases.tile_table import CONTRACT, NODES, TILE_VARIABLES
 from magtiles.schemas.errors import IntegrityError
@@ -32,8 +33,8 @@ _COORDINATE_TOLERANCE = 1e-6
 class Tile:
     """A verified tile in memory; `nbytes` is what it holds, caches included.
 
-    Not thread-safe, as HDF5 is not: the store holds the lock. Raises IntegrityError when the
-    bytes are no tile of this release.
+    Its caches are not thread-safe: the store holds a lock. Raises IntegrityError when the bytes
+    are no tile of this release.
     """
 
     def __init__(self, data: bytes, record: TileRecord, manifest: Manifest) -> None:
@@ -43,16 +44,25 @@ class Tile:
         self._planes: dict[tuple[str, int], NDArray[Any]] = {}
         self._coefficients: dict[tuple[str, int, int, int], Floats] = {}
         self._core = manifest.lattice.core(record.row, record.column)
+        self._file: Any = None
         try:
-            self._file = netCDF4.Dataset("tile.nc", memory=data)
-            self._file.set_auto_maskandscale(False)
-            self._check()
+            with LOCK:
+                # Without cycles in it, the file is closed here and not by whichever thread
+                # collects garbage while another one is inside HDF5.
+                self._file = netCDF4.Dataset("tile.nc", memory=data, keepweakref=True)
+                self._file.set_auto_maskandscale(False)
+                self._check()
         except (OSError, RuntimeError, AttributeError, ValueError) as caught:
             raise self._problem(f"is no readable tile: {caught}", "netCDF-4") from None
 
     def close(self) -> None:
         """Give the file's memory back; arrays already handed out stay valid."""
-        self._file.close()
+        with LOCK:
+            file, self._file = self._file, None
+            if file is not None:
+                file.close()
+
+    __del__ = close
 
     def plane(self, name: str, level: int = 0) -> NDArray[Any]:
         """One variable at one level (or the whole of a two-dimensional one), halo included."""
@@ -63,21 +73,23 @@ class Tile:
         return self._planes[key]
 
     def _read(self, name: str, level: int, window: Window) -> NDArray[Any]:
-        variable = self._variable(name)
-        place = (level, *window) if len(variable.dimensions) == 3 else window
         try:
-            values = np.asarray(variable[place])
+            with LOCK:
+                variable = self._variable(name)
+                place = (level, *window) if len(variable.dimensions) == 3 else window
+                values = np.asarray(variable[place])
         except (OSError, RuntimeError) as caught:
             raise self._problem(f"{name} cannot be read: {caught}", "whole data") from None
         return self._finite(name, values)
 
     def everything(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         """All arrays by name, and the global attributes."""
-        arrays = {
-            name: self._finite(name, np.asarray(variable[...]))
-            for name, variable in self._file.variables.items()
-        }
-        return arrays, {name: self._file.getncattr(name) for name in self._file.ncattrs()}
+        with LOCK:
+            arrays = {
+                name: self._finite(name, np.asarray(variable[...]))
+                for name, variable in self._file.variables.items()
+            }
+            return arrays, {name: self._file.getncattr(name) for name in self._file.ncattrs()}
 
     def coefficients(
         self, family: str, level: int, block: tuple[int, int]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,6 +14,7 @@ from synthetic_release import World
 
 from magtiles.catalog import Release, open_release
 from magtiles.catalog.kernels.geodesy import metres_per_degree
+from magtiles.catalog.releases.tile import Tile
 from magtiles.schemas.errors import QueryError
 
 INSIDE = {"latitude": 44.2, "longitude": 10.3, "height": 500.0}
@@ -314,3 +317,29 @@ def test_threads_and_a_cache_of_one_tile_change_nothing(world: World, folder: Pa
     with ThreadPoolExecutor(4) as pool:
         for found in pool.map(lambda _: shared.total(lat, lon, 700.0), range(8)):
             np.testing.assert_array_equal(found, wanted)
+
+
+def test_releases_in_threads_of_their_own_share_one_library(world: World, folder: Path) -> None:
+    # HDF5 crashes the process where two threads are in it.
+    wanted = len(list(open_release(folder).tiles()))
+    with ThreadPoolExecutor(4) as pool:
+        found = pool.map(lambda _: len(list(open_release(folder).tiles())), range(12))
+        assert set(found) == {wanted}
+
+
+def test_files_are_closed_with_the_release_not_by_the_garbage_collector(
+    world: World, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The collector runs in any thread, also while another one is inside HDF5.
+    opened: list[weakref.ref[Tile]] = []
+    monkeypatch.setattr(Tile, "_check", lambda tile: opened.append(weakref.ref(tile)))
+    lat, lon = positions(world, 50, seed=6)
+    gc.disable()
+    try:
+        release = open_release(folder)
+        release.anomaly.total(lat, lon, 700.0)
+        assert opened[0]() is not None
+        del release
+        assert [tile() for tile in opened] == [None] * len(opened)
+    finally:
+        gc.enable()
