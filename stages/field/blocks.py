@@ -46,9 +46,12 @@ from magtiles.stages.field.windows import MapWindows, Span, local, spans
 Real = NDArray[np.float64]
 Single = NDArray[np.float32]
 
-_MARGIN_CELLS = 192.0
+_MARGIN_CELLS, _LOW_MARGIN_CELLS = 192.0, 288.0
 _FADE = 0.5
-"""How far around its nodes a block looks, in cells, and over which part of that it fades."""
+"""How far around its nodes a block looks, in cells, and over which part of that it fades.
+
+Farther at low inclination, where kernels reach far along the wedge that is damped.
+"""
 OVERLAP_CELLS = 24.0
 """How far blocks reach into each other, in cells: there their products are blended."""
 
@@ -85,7 +88,7 @@ class BlockSolution:
     """Products (9, m, n), sigma by group, and flags of a block's nodes, as of a whole level."""
 
     products: Single
-    sigmas: dict[str, Real]
+    sigmas: dict[str, Single]
     flags: NDArray[np.uint8]
 
 
@@ -137,7 +140,8 @@ def _short_field(
     inner: Sequence[Span],
 ) -> AnomalousField:
     """The field of the short wavelengths in and around a window of the map."""
-    reach = _MARGIN_CELLS * max(windows.spacing)
+    low = abs(float(whole.attrs["direction"][2])) < LOW_INCLINATION_SINE
+    reach = (_LOW_MARGIN_CELLS if low else _MARGIN_CELLS) * max(windows.spacing)
     margins = [int(np.ceil(reach / d)) for d in windows.spacing]
     rows, columns = (
         (first - m, first - m + odd_fast_length(last - first + 2 * m))
@@ -153,30 +157,30 @@ def _short_field(
         )
     ]
     values *= np.multiply.outer(*fades)
-    direction, variation = _split(directions, whole.attrs["direction"])
+    direction, variation, rounds = _split(directions, whole)
     shape = values.shape[0], values.shape[1]
     inversion = Inversion(Wavenumbers(shape, around.spacing), direction)
-    total = follow(values, inversion, variation, (0, 0), shape)
+    total = follow(values, inversion, variation, (0, 0), shape, rounds).total
     place = Padding((-rows[0], -columns[0]), shape, shape)
     ratio = float(whole.attrs["noise_to_signal"])
     return AnomalousField(place, inversion.wavenumbers, inversion, total, ratio)
 
 
 def _split(
-    directions: Direction, whole: NDArray[np.float64]
-) -> tuple[tuple[float, float, float], list[Real]]:
-    """The direction to solve a block for, and what that of its nodes differs from it.
+    directions: Direction, whole: xr.Dataset
+) -> tuple[tuple[float, float, float], list[Real], int | None]:
+    """The direction to solve a block for, what that of its nodes differs from it, and the rounds.
 
-    It is the block's own mean. Near zero inclination, where the solution depends on it, blocks of a
-    map that hardly turns take the map's, lest they differ.
+    Where they differ little from the map's direction it is that one, in as many rounds as the
+    long wavelengths took: what blocks sum to is then what one transform gives. Elsewhere it is the
+    block's own mean, which is sooner followed.
     """
-    direction, variation = split_direction(directions)
-    turned = float(np.linalg.norm(np.subtract(direction, whole)))
-    if abs(whole[2]) >= LOW_INCLINATION_SINE or turned > _LITTLE_TURN:
-        return direction, variation
-    north, east, down = (float(part) for part in whole)
-    kept = [part - m for part, m in zip(directions, whole, strict=True)]
-    return (north, east, down), kept
+    first, second, third = (float(part) for part in whole.attrs["direction"])
+    of_map = first, second, third
+    variation = [part - m for part, m in zip(directions, of_map, strict=True)]
+    if max(np.abs(part).max() for part in variation) < _LITTLE_TURN:
+        return of_map, variation, int(whole.attrs["rounds"])
+    return *split_direction(directions), None
 
 
 def _fade(span: Span, own: Span, margin: int, size: int, offset: int) -> Real:

@@ -90,9 +90,9 @@ def derive_components(grid: xr.Dataset, *, params: DeriveComponentsParams) -> xr
     axes = params.latitude, params.longitude
     nodes = latest("nodes", (key, angles, axes), lambda: locate(target, plane_map, ambient))
     products = evaluate_products(field, nodes, params.height_m)
+    flags = quality_flags(plane_map, nodes, params.height_m)
     survey = survey_variance(plane_map, nodes.row, nodes.column)
     sigmas = budget(grid, plane_map, field, params.height_m).sigma(survey, nodes.row, nodes.column)
-    flags = quality_flags(plane_map, nodes, params.height_m)
     return _assemble(grid, target, nodes, params.height_m, products, sigmas, flags)
 
 
@@ -181,7 +181,7 @@ def _assemble(
     nodes: Nodes,
     height_gain: float,
     products: Single,
-    sigmas: dict[str, NDArray[np.float64]],
+    sigmas: dict[str, Single],
     flags: NDArray[np.uint8],
 ) -> xr.Dataset:
     planar = target.dims[0] == "y"

@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
@@ -84,7 +85,7 @@ def solve(plane_map: PlaneMap, ambient: AmbientSource, padding: Padding) -> Anom
     mean, variation = split_direction(directions)
     inversion = Inversion(wavenumbers, mean)
     padded = pad(plane_map.values, padding)
-    total = follow(padded, inversion, variation, padding.offset, padding.map_shape)
+    total = follow(padded, inversion, variation, padding.offset, padding.map_shape).total
     ratio = noise_to_signal(float(np.mean(plane_map.sigma**2)), float(plane_map.values.var()))
     return AnomalousField(padding, wavenumbers, inversion, total, ratio)
 
@@ -111,24 +112,39 @@ def split_direction(directions: Direction) -> tuple[tuple[float, float, float], 
     return (float(mean[0]), float(mean[1]), float(mean[2])), variation
 
 
+class Followed(NamedTuple):
+    """Spectrum of T - df.B, and after how many rounds of substitution."""
+
+    total: Complex
+    rounds: int
+
+
 def follow(
     padded: Real,
     inversion: Inversion,
     variation: Sequence[Real],
     offset: tuple[float, float],
     shape: tuple[float, float],
-) -> Complex:
+    rounds: int | None = None,
+) -> Followed:
     """Spectrum of T - df.B, by substitution until a further round would change it by 0.1 %.
 
     `variation` holds the parts of df on a coarse lattice that covers `shape` nodes of `padded`
-    from `offset` on, from corner to corner; it goes on unchanged beyond them.
+    from `offset` on, from corner to corner; it goes on unchanged beyond them. With `rounds`, that
+    many are made: the result is then linear in T, part by part the same as all at once.
     """
     total = forward(padded)
     size = float(np.linalg.norm(padded - padded.mean()))
     if size == 0.0 or max(np.abs(part).max() for part in variation) < _TOLERANCE / 10:
-        return total
+        return Followed(total, 0)
+    if rounds is not None:
+        for _ in range(rounds):
+            correction = _varying_part(total, inversion, variation, offset, shape)
+            total = forward(padded - correction)
+        return Followed(total, rounds)
     previous = np.zeros(padded.shape)
     change = first = np.inf
+    done = 0
     for _ in range(_ROUNDS):
         correction = _varying_part(total, inversion, variation, offset, shape)
         last, change = change, float(np.linalg.norm(correction - previous)) / size
@@ -136,9 +152,10 @@ def follow(
             _accept_or_refuse(last)
             break
         total, previous, first = forward(padded - correction), correction, min(first, change)
+        done += 1
         if change * first < _TOLERANCE:
             break
-    return total
+    return Followed(total, done)
 
 
 def _accept_or_refuse(change: float) -> None:

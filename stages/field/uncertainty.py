@@ -23,10 +23,12 @@ from magtiles.stages.field.solve import AnomalousField
 from magtiles.stages.field.spectral import TENSOR, VECTOR, Inversion, fade
 
 Real = NDArray[np.float64]
+Single = NDArray[np.float32]
 
 GROUPS = ("total", "vector", "tensor")
 _FLOOR = {"total": 1e-3, "vector": 1e-3, "tensor": 1e-6}
 _PER_KM2 = 1e6
+_ROWS = 256
 
 
 @dataclass(frozen=True)
@@ -48,22 +50,27 @@ class Budget:
     signal: float
     missing: MissingData
 
-    def sigma(self, survey: Real, row: Real, column: Real) -> dict[str, Real]:
+    def sigma(self, survey: Real, row: Real, column: Real) -> dict[str, Single]:
         """Sigma of each product group at fractional rows and columns of the map.
 
         `survey`: variance of the survey's own values there, nT^2. "total" and "vector" in nT,
         "tensor" in nT/km; vector and tensor per component, rms over the components.
         """
-        rough = self.missing.at("roughness", row, column)
-        return {
-            group: np.sqrt(
-                survey * self.noise[group]
-                + rough * (self.faded[group] + self.signal * self.alias[group])
-                + self.missing.at(group, row, column)
-                + _FLOOR[group] ** 2
-            )
-            for group in GROUPS
-        }
+        out = {group: np.empty(row.shape, np.float32) for group in GROUPS}
+        # Some rows at a time: all that is added up would else be in memory at once.
+        for first in range(0, row.shape[0], _ROWS):
+            part = slice(first, first + _ROWS)
+            here = row[part], column[part]
+            rough = self.missing.at("roughness", *here)
+            own = survey[part] if survey.ndim else survey
+            for group in GROUPS:
+                out[group][part] = np.sqrt(
+                    own * self.noise[group]
+                    + rough * (self.faded[group] + self.signal * self.alias[group])
+                    + self.missing.at(group, *here)
+                    + _FLOOR[group] ** 2
+                )
+        return out
 
 
 def budget(

@@ -22,6 +22,7 @@ from magtiles.stages.field.missing import MissingData, ThinMap, missing_data, th
 from magtiles.stages.field.padding import Padding, plan_padding
 from magtiles.stages.field.product import Level
 from magtiles.stages.field.solve import (
+    Followed,
     coarse_directions,
     follow,
     noise_to_signal,
@@ -65,7 +66,7 @@ def survey_whole(windows: MapWindows, ambient: AmbientSource, height_gain: float
     padded map, of the long wavelengths: "map", the anomaly as it is mapped (nT), and the nine
     products at the level (nT, nT/km) along plane axes; `missing_*`, as of `MissingData`.
     Attributes: `mean` and `sigma` of the map, the `direction` that the long wavelengths' total is
-    along, and the numbers of the uncertainty's `Budget`.
+    along and the `rounds` it took, and the numbers of the uncertainty's `Budget`.
     """
     padding = plan_padding(windows.shape, windows.spacing, height_gain)
     sums = _pass(windows, padding)
@@ -73,11 +74,11 @@ def survey_whole(windows: MapWindows, ambient: AmbientSource, height_gain: float
     direction, variation = split_direction(directions)
     ratio = noise_to_signal(sums.noise, sums.variance)
     thinned = sums.coarse + windows.mean
-    inversion, observed, total = _long_spectra(thinned, padding, windows, direction, variation)
+    inversion, observed, found = _long_spectra(thinned, padding, windows, direction, variation)
     variables: dict[str, tuple[tuple[str, str], NDArray[np.floating]]] = {}
     for name, spectrum, height in [
         ("map", observed, 0.0),
-        *((n, total, height_gain) for n in NINE),
+        *((n, found.total, height_gain) for n in NINE),
     ]:
         level = Level(spectrum, inversion, height, ratio, _DENSITY)
         product = "total" if name == "map" else name
@@ -90,6 +91,7 @@ def survey_whole(windows: MapWindows, ambient: AmbientSource, height_gain: float
         "mean": windows.mean,
         "sigma": windows.sigma,
         "direction": np.array(direction),
+        "rounds": found.rounds,
         "noise_to_signal": ratio,
         "signal": sums.signal,
         "thinning": missing.thinning,
@@ -193,7 +195,7 @@ def _long_spectra(
     windows: MapWindows,
     direction: Direction,
     variation: list[Real],
-) -> tuple[Inversion, Complex, Complex]:
+) -> tuple[Inversion, Complex, Followed]:
     """Spectra of the long wavelengths: as mapped, and their total along the mean direction."""
     ratio = [n / m for n, m in zip(padding.shape, thinned.shape, strict=True)]
     spacing = windows.spacing[0] * ratio[0], windows.spacing[1] * ratio[1]
@@ -208,8 +210,8 @@ def _long_spectra(
     observed = kept * forward(thinned)
     # Filtered first and followed then: the other way round is not the same where f turns.
     mapped = inverse(observed.copy(), w.shape, slice(None), slice(None)).astype(float, copy=False)
-    total = follow(mapped, inversion, variation, (offset[0], offset[1]), shape)
-    return inversion, observed, total
+    found = follow(mapped, inversion, variation, (offset[0], offset[1]), shape)
+    return inversion, observed, found
 
 
 def _long(k: Real) -> Real:
