@@ -76,11 +76,13 @@ class LevelJob:
 
 @dataclass(frozen=True)
 class LevelTasks:
-    """The tasks of a level that has been begun; none where it was already there."""
+    """The tasks of a level that has been begun, of which the last puts it together.
+
+    None where it was already there.
+    """
 
     job: LevelJob
     made_from: Identity
-    blocks: Sequence[Sequence[Block]]
     tasks: Sequence[Task[None]]
 
 
@@ -88,7 +90,8 @@ def begin(tasks: Tasks, job: LevelJob) -> LevelTasks:
     """Ask for all that a level needs, unless its receipt says that it is there."""
     made_from = receipts.identity(STAGE, job.params, {"grid": [job.grid]})
     if receipts.why_stale(job.out, made_from) is None:
-        return LevelTasks(job, made_from, (), ())
+        shutil.rmtree(job.folder, ignore_errors=True)
+        return LevelTasks(job, made_from, ())
     with open_artifact(job.grid) as grid:
         blocks = large_level(grid, job.params, known=_UNREAD).blocks
     whole = tasks.submit(_make_whole, job, made_from)
@@ -97,22 +100,8 @@ def begin(tasks: Tasks, job: LevelJob) -> LevelTasks:
         for i, row in enumerate(blocks)
         for j in range(len(row))
     ]
-    return LevelTasks(job, made_from, blocks, [whole, *parts])
-
-
-def finish(begun: LevelTasks) -> Path:
-    """Put the level together when all its tasks are done. Raises MagtilesError for a full disk."""
-    job = begun.job
-    if begun.tasks:
-        try:
-            _write_level(job, begun.blocks)
-        except (OSError, RuntimeError) as caught:
-            raise MagtilesError(
-                f"cannot be written ({caught})", where=job.out, remedy="check space and permissions"
-            ) from caught
-        receipts.write_receipt(job.out, begun.made_from, contracts.resolve(STAGE.output))
-        shutil.rmtree(job.folder, ignore_errors=True)
-    return job.out
+    level = tasks.submit(_make_level, job, made_from, blocks, after=parts)
+    return LevelTasks(job, made_from, [whole, *parts, level])
 
 
 def _make_whole(job: LevelJob, made_from: Identity) -> None:
@@ -140,6 +129,19 @@ def _make_block(job: LevelJob, made_from: Identity, place: tuple[int, int]) -> N
     contracts.check(made, STAGE.output, where=f"block of stage {STAGE.name}")
     write_artifact(made, out, STAGE.output)
     receipts.write_receipt(out, identity, contracts.resolve(STAGE.output))
+
+
+def _make_level(job: LevelJob, made_from: Identity, blocks: Sequence[Sequence[Block]]) -> None:
+    """The level from its blocks, which then go. Raises MagtilesError for a full disk."""
+    if receipts.why_stale(job.out, made_from) is not None:
+        try:
+            _write_level(job, blocks)
+        except (OSError, RuntimeError) as caught:
+            raise MagtilesError(
+                f"cannot be written ({caught})", where=job.out, remedy="check space and permissions"
+            ) from caught
+        receipts.write_receipt(job.out, made_from, contracts.resolve(STAGE.output))
+    shutil.rmtree(job.folder, ignore_errors=True)
 
 
 def _write_level(job: LevelJob, blocks: Sequence[Sequence[Block]]) -> None:
@@ -183,8 +185,8 @@ def _write_strips(
 ) -> float:
     """Write a variable of a level, and give its mean."""
 
-    def read(block: Block) -> NDArray[Any]:
-        return np.asarray(parts[block][variable.name].values)
+    def read(block: Block, rows: slice, columns: slice) -> NDArray[Any]:
+        return np.asarray(parts[block][variable.name][rows, columns].values)
 
     total = 0.0
     for (first, last), strip in strips(blocks, variable.name, read):

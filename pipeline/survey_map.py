@@ -12,7 +12,7 @@ import numpy as np
 
 from magtiles.catalog.releases.lattice import Lattice
 from magtiles.pipeline.artifacts import open_artifact
-from magtiles.pipeline.large_levels import LevelJob, LevelTasks, begin, finish
+from magtiles.pipeline.large_levels import LevelJob, LevelTasks, begin
 from magtiles.pipeline.product import AnomalyTable, SurveyMap
 from magtiles.pipeline.source_paths import data_files, manifest_inputs
 from magtiles.pipeline.steps import MapPlan, Steps, node_axes
@@ -171,7 +171,7 @@ class Levels:
         begun = self._begun.pop(height)
         tell = self._steps.within(f"blocks of {job.out.stem}")
         self._tasks.results(begun.tasks, lambda done: tell(done, len(begun.tasks)))
-        return finish(begun)
+        return job.out
 
     def _job(self, height: float) -> LevelJob:
         out = self._folder / f"level-{height:.12g}m.nc"

@@ -135,8 +135,8 @@ def derive_block(level: LargeLevel, whole: xr.Dataset, block: Block) -> xr.Datas
 def _blended(grid: xr.Dataset, params: DeriveComponentsParams) -> xr.Dataset:
     """A level of blocks, in memory."""
     level = large_level(grid, params)
-    whole = level.survey()
-    made = {block: derive_block(level, whole, block) for row in level.blocks for block in row}
+    known = level.survey()
+    made = {block: derive_block(level, known, block) for row in level.blocks for block in row}
     first = made[level.blocks[0][0]]
     dims, axes = level.target.dims, (level.target.rows, level.target.columns)
     coordinates = {
@@ -146,8 +146,8 @@ def _blended(grid: xr.Dataset, params: DeriveComponentsParams) -> xr.Dataset:
     for name, variable in first.data_vars.items():
         if variable.ndim:
             values = {block: part[name].values for block, part in made.items()}
-            read = strips(level.blocks, str(name), values.__getitem__)
-            out[name] = dims, np.concatenate([strip for _, strip in read]), variable.attrs
+            whole = strips(level.blocks, str(name), lambda b, *part, of=values: of[b][part])
+            out[name] = dims, np.concatenate([strip for _, strip in whole]), variable.attrs
         else:
             out[name] = variable
     means = (float(out[f"ambient_{axis}"].mean(dtype=float)) for axis in ("north", "east", "down"))

@@ -22,7 +22,7 @@ from magtiles.stages.field.direction import AmbientSource
 from magtiles.stages.field.level import PRODUCTS
 from magtiles.stages.field.target import Nodes, Target, locate
 from magtiles.stages.field.whole import survey_whole
-from magtiles.stages.field.windows import MapWindows, Span
+from magtiles.stages.field.windows import MapWindows, Span, spans
 
 Real = NDArray[np.float64]
 
@@ -30,6 +30,8 @@ LARGEST = 4096 * 4096
 """Nodes of a map that is still transformed at once, and half those of a level made at once."""
 BLOCK_NODES = 2048
 _METRES_PER_DEGREE = 111_195.0
+_STRIP = 512
+"""Rows of a level that are put together at a time."""
 
 
 def is_large(shape: tuple[int, int], target: tuple[int, int]) -> bool:
@@ -87,40 +89,47 @@ class LargeLevel:
 
 
 def strips(
-    blocks: Sequence[Sequence[Block]], name: str, read: Callable[[Block], NDArray[Any]]
+    blocks: Sequence[Sequence[Block]],
+    name: str,
+    read: Callable[[Block, slice, slice], NDArray[Any]],
 ) -> Iterator[tuple[Span, NDArray[Any]]]:
     """A variable of a level, in strips of rows from south to north, from that of its blocks.
 
-    `read` gives a block's values on its outer nodes. Products are blended where blocks overlap;
-    all else, which no transform makes, is the block's that owns the node.
+    `read` gives some rows and columns of a block's values on its outer nodes. Products are blended
+    where blocks overlap; all else, which no transform makes, is the block's that owns the node.
     """
-    width = blocks[0][-1].columns[1]
-    below = None
-    for row, above in itertools.zip_longest(blocks, blocks[1:]):
-        first, last = row[0].outer_rows if name in PRODUCTS else row[0].rows
+    shape = blocks[-1][-1].rows[1], blocks[-1][-1].columns[1]
+    for span in spans(shape[0], _STRIP):
         strip: NDArray[Any] | None = None
-        for block in row:
-            part, columns = _part(block, name, read(block))
+        for block in itertools.chain.from_iterable(blocks):
+            rows = block.outer_rows if name in PRODUCTS else block.rows
+            first, last = max(span[0], rows[0]), min(span[1], rows[1])
+            if first >= last:
+                continue
+            part, columns = _part(block, name, (first, last), read)
             if strip is None:
-                strip = np.zeros((last - first, width), part.dtype)
-            strip[:, slice(*columns)] += part
+                strip = np.zeros((span[1] - span[0], shape[1]), part.dtype)
+            strip[first - span[0] : last - span[0], slice(*columns)] += part
         assert strip is not None
-        if below is not None:
-            strip[: below.shape[0]] += below
-        end = last if above is None or name not in PRODUCTS else above[0].outer_rows[0]
-        yield (first, end), strip[: end - first]
-        below = strip[end - first :]
+        yield span, strip
 
 
-def _part(block: Block, name: str, values: NDArray[Any]) -> tuple[NDArray[Any], Span]:
-    """What a block adds to a strip, and to which of its columns."""
-    outer = block.outer_rows, block.outer_columns
-    own = block.rows, block.columns
+def _part(
+    block: Block, name: str, rows: Span, read: Callable[[Block, slice, slice], NDArray[Any]]
+) -> tuple[NDArray[Any], Span]:
+    """What a block adds to some rows of a level, and to which columns."""
+    columns = block.outer_columns if name in PRODUCTS else block.columns
+    down, across = (
+        slice(span[0] - outer[0], span[1] - outer[0])
+        for span, outer in zip(
+            (rows, columns), (block.outer_rows, block.outer_columns), strict=True
+        )
+    )
+    values = read(block, down, across)
     if name in PRODUCTS:
-        weights = np.multiply.outer(*(_ramp(o, e) for o, e in zip(own, outer, strict=True)))
-        return (values * weights).astype(values.dtype), block.outer_columns
-    rows, columns = (slice(o[0] - e[0], o[1] - e[0]) for o, e in zip(own, outer, strict=True))
-    return values[rows, columns], block.columns
+        weights = _ramp(block.rows, block.outer_rows)[down], _ramp(block.columns, columns)
+        values = (values * np.multiply.outer(*weights)).astype(values.dtype)
+    return values, columns
 
 
 def _ramp(own: Span, outer: Span) -> Real:
