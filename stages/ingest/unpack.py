@@ -32,8 +32,8 @@ def unpacked(path: Path, member: str | None = None) -> Iterator[Path]:
 
     Parameters
     ----------
-    member : which file of a zip archive of several; files that belong to it (a data file beside
-        its header) are unpacked with it.
+    member : which file of a zip archive of several, by its name or its whole path there; files
+        that belong to it (a data file beside its header) are unpacked with it.
 
     Raises FormatError for a damaged archive or one that unpacks to more than 16 GiB;
     SourceError where the member is not clear.
@@ -80,25 +80,31 @@ def _expand(kind: str, path: Path, folder: Path) -> Path:
 
 def _unzip(path: Path, folder: Path, member: str | None) -> Path:
     with zipfile.ZipFile(path) as archive:
-        found = {
-            PurePosixPath(i.filename).name: i
+        found = [
+            PurePosixPath(i.filename)
             for i in archive.infolist()
             if not i.is_dir() and "__MACOSX" not in i.filename
-        }
+        ]
         wanted = _choose(found, path, member)
-        for name, info in found.items():
-            if name == wanted or PurePosixPath(name).stem == PurePosixPath(wanted).stem:
-                with archive.open(info) as packed:
-                    _copy(packed, folder / name, path)
-    return folder / wanted
+        for one in found:
+            if one.parent == wanted.parent and one.stem == wanted.stem:
+                with archive.open(str(one)) as packed:
+                    _copy(packed, folder / one.name, path)
+    return folder / wanted.name
 
 
-def _choose(found: dict[str, zipfile.ZipInfo], path: Path, member: str | None) -> str:
-    names = ", ".join(sorted(found)) or "none"
+def _choose(found: list[PurePosixPath], path: Path, member: str | None) -> PurePosixPath:
+    """The file of the archive that `member` names, alone or with its folders."""
+    names = ", ".join(sorted(map(str, found))) or "none"
     if member is not None:
-        if member not in found:
-            raise SourceError(f"key 'member' is '{member}'", where=path, expected=f"one of {names}")
-        return member
+        meant = [one for one in found if member in (str(one), one.name)]
+        if len(meant) != 1:
+            raise SourceError(
+                f"key 'member' is '{member}'" + (f", {len(meant)} times there" if meant else ""),
+                where=path,
+                expected=f"one of {names}",
+            )
+        return meant[0]
     if len(found) != 1:
         raise SourceError(
             f"the archive holds {len(found)} files: {names}",
@@ -106,7 +112,7 @@ def _choose(found: dict[str, zipfile.ZipInfo], path: Path, member: str | None) -
             expected="one",
             remedy="choose one with the key 'member'",
         )
-    return next(iter(found))
+    return found[0]
 
 
 def _copy(packed: _Readable, out: Path, path: Path) -> None:

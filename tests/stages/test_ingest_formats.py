@@ -162,13 +162,13 @@ REFUSED = [
     Refuse(
         in_zip(text(" "), "a.txt"),
         SourceError,
-        r"holds 2 files: a.txt, grid.xyz.*'member'",
+        r"holds 2 files: a.txt, inner/grid.xyz.*'member'",
         "zip-of-two",
     ),
     Refuse(
         in_zip(text(" ")),
         SourceError,
-        "key 'member' is 'b'; expected one of grid.xyz",
+        "key 'member' is 'b'; expected one of inner/grid.xyz",
         "member",
         (("member", "b"),),
     ),
