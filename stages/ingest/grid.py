@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
-from magtiles.schemas.errors import SourceError
+from magtiles.schemas.errors import FormatError, SourceError
 from magtiles.stages.declare import FILES, Stage
 from magtiles.stages.ingest.gridded import (
     GridFile,
@@ -50,15 +51,9 @@ def ingest_grid(files: Sequence[Path], *, params: IngestGridParams) -> xr.Datase
     """
     file = read_grid(files, ANOMALY_GRID, params)
     own_sigma = file.raw.uncertainty is not None
-    if own_sigma and file.params.uncertainty_nt is not None:
-        raise SourceError(
-            f"key 'uncertainty_nt' is {file.params.uncertainty_nt}, but the file "
-            f"{file.path.name} has its own uncertainty",
-            where=file.where,
-            remedy="remove the key",
-        )
     file = settle(file, _NECESSARY if own_sigma else (*_NECESSARY, "uncertainty_nt"))
-    return _dataset(regular(file), file)
+    grid = regular(file)
+    return _dataset(grid, _sigma(grid, file), file)
 
 
 STAGE = Stage(
@@ -71,10 +66,37 @@ STAGE = Stage(
 )
 
 
-def _dataset(grid: RegularGrid, file: GridFile[IngestGridParams]) -> xr.Dataset:
-    params, sigma = file.params, grid.uncertainty
-    if sigma is None:
-        sigma = np.asarray(params.uncertainty_nt, dtype=np.float64)
+def _sigma(grid: RegularGrid, file: GridFile[IngestGridParams]) -> NDArray[np.float64]:
+    """1 sigma in nT: the file's own, and where it states none the key `uncertainty_nt`.
+
+    A value that is not above zero, such as EMAG2's -888, is none; at voids it becomes NaN.
+    """
+    own, given = grid.uncertainty, file.params.uncertainty_nt
+    if own is None:
+        return np.asarray(given, dtype=np.float64)
+    lacks = ~(own > 0.0) & ~np.isnan(grid.values)
+    if given is not None and not lacks.any():
+        raise SourceError(
+            f"key 'uncertainty_nt' is {given}, but the file {file.path.name} has its own "
+            "uncertainty everywhere",
+            where=file.where,
+            remedy="remove the key",
+        )
+    marks = np.broadcast_to(own, lacks.shape)[lacks & ~np.isnan(own)]
+    if given is None and marks.size:
+        raise FormatError(
+            f"{marks.size} values of its uncertainty are {marks[0]:g} or otherwise not above zero",
+            where=file.path,
+            remedy="set uncertainty_nt, which is then taken where the file states none",
+        )
+    stated = np.where(own > 0.0, own, np.nan)
+    return stated if given is None else np.where(lacks, given, stated)
+
+
+def _dataset(
+    grid: RegularGrid, sigma: NDArray[np.float64], file: GridFile[IngestGridParams]
+) -> xr.Dataset:
+    params = file.params
     variables: dict[str, Any] = {
         "magnetic_anomaly": (
             grid.dims,

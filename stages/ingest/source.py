@@ -81,7 +81,10 @@ class IngestGridParams(GridFileParams):
         "1", default=None, min_length=1, doc=f"What the anomaly is; default: {TOTAL_FIELD_ANOMALY}."
     )
     uncertainty_nt: float | None = quantity(
-        "nT", default=None, gt=0, doc="1 sigma of the grid's own error."
+        "nT",
+        default=None,
+        gt=0,
+        doc="1 sigma of the grid's own error; where the file has its own, of nodes it leaves out.",
     )
     line_spacing_m: float | None = quantity(
         "m", default=None, gt=0, doc="Spacing of the flight lines."
