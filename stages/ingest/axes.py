@@ -42,6 +42,13 @@ def _irregular(nodes: NDArray[np.float64], allowed: float, where: str) -> Format
     )
 
 
+def unbroken_longitudes(longitude: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Longitudes that jump by a turn at the date line, or at Greenwich, made to count on."""
+    if not np.all(np.isfinite(longitude)):
+        return longitude  # which `regular_axis` names
+    return np.unwrap(longitude, period=360.0)
+
+
 def wrapped_longitudes(
     longitude: NDArray[np.float64], *, where: str
 ) -> tuple[NDArray[np.float64], NDArray[np.intp]]:

@@ -94,8 +94,8 @@ def _choose_variable(dataset: xr.Dataset, path: Path, params: GridFileParams) ->
     measures = params.measures
     right = [n for n in grids if measures.knows(str(dataset[n].attrs.get("units", "")))]
     found = [n for n in right if n.removesuffix("_uncertainty") not in set(right) - {n}]
-    if not found and params.units is not None:
-        found = [n for n in grids if "units" not in dataset[n].attrs]
+    if not found:
+        found = [n for n in grids if not str(dataset[n].attrs.get("units", "")).strip()]
     if len(found) != 1:
         raise SourceError(
             f"{len(found)} variables could be the grid's: {', '.join(found) or 'none'}",
@@ -191,10 +191,10 @@ def _stated(dataset: xr.Dataset, variable: xr.DataArray, x_dim: str) -> dict[str
         says[key] = value.item() if isinstance(value, np.generic) else value
     if "wavelength_band_km" in says:
         says["wavelength_band_km"] = tuple(float(v) for v in says["wavelength_band_km"])
-    if "units" in variable.attrs:
+    if str(variable.attrs.get("units", "")).strip():
         says["units"] = str(variable.attrs["units"])
     for name in ("_FillValue", "missing_value"):
-        mark = np.atleast_1d(variable.attrs.get(name, np.nan))
+        mark = _numbers(variable, name)
         if mark.size == 1 and np.isfinite(mark[0]):
             says["no_data"] = float(mark[0])
     if "bounds" in dataset[x_dim].attrs:
@@ -220,17 +220,50 @@ def _unpacked(variable: xr.DataArray, extra_mark: float | None) -> NDArray[np.fl
     attrs = variable.attrs
     if str(attrs.get("_Unsigned", "false")).lower() == "true" and stored.dtype.kind == "i":
         stored = stored.view(f"u{stored.dtype.itemsize}")
+    marks = np.concatenate([_numbers(variable, n) for n in ("_FillValue", "missing_value")])
+    if extra_mark is not None:
+        marks = np.append(marks, extra_mark)
+    if attrs.get("_FillValue") is None and stored.dtype.itemsize > 1:  # a byte may be any value
+        marks = np.append(marks, netCDF4.default_fillvals[stored.dtype.str[1:]])
     void = np.zeros(stored.shape, dtype=bool)
-    marks = [attrs.get("_FillValue"), attrs.get("missing_value"), extra_mark]
-    if attrs.get("_FillValue") is None and stored.dtype.kind == "f":
-        marks.append(netCDF4.default_fillvals[stored.dtype.str[1:]])
-    for mark in (one for m in marks if m is not None for one in np.atleast_1d(m)):
-        void |= stored == stored.dtype.type(mark)
-    low, high = attrs.get("valid_range", (attrs.get("valid_min"), attrs.get("valid_max")))
-    if low is not None:
-        void |= stored < low
-    if high is not None:
-        void |= stored > high
-    values = stored * np.float64(attrs.get("scale_factor", 1.0))
-    values = values + np.float64(attrs.get("add_offset", 0.0))
+    for mark in marks:
+        void |= _equal(stored, mark)
+    limits = _numbers(variable, "valid_range")
+    low, high = _numbers(variable, "valid_min"), _numbers(variable, "valid_max")
+    if limits.size == 2:
+        low, high = limits[:1], limits[1:]
+    if low.size:
+        void |= stored < low[0]
+    if high.size:
+        void |= stored > high[0]
+    scale, offset = _numbers(variable, "scale_factor"), _numbers(variable, "add_offset")
+    values = stored * np.float64(scale[0] if scale.size else 1.0)
+    values = values + np.float64(offset[0] if offset.size else 0.0)
     return np.where(void, np.nan, values)
+
+
+def _numbers(variable: xr.DataArray, name: str) -> NDArray[np.float64]:
+    """The numbers in an attribute, some write them as text; none where it is missing.
+
+    Raises FormatError for other text.
+    """
+    said = variable.attrs.get(name)
+    if said is None:
+        return np.empty(0)
+    words = said.replace(",", " ").split() if isinstance(said, str) else said
+    try:
+        return np.atleast_1d(np.asarray(words, dtype=np.float64))
+    except (ValueError, TypeError):
+        raise FormatError(
+            f"attribute '{name}' is '{said}'",
+            where=f"variable '{variable.name}'",
+            expected="a number",
+        ) from None
+
+
+def _equal(stored: NDArray[Any], mark: float) -> NDArray[np.bool_]:
+    """Where values are a mark, in their own precision; nowhere where their type cannot hold it."""
+    if stored.dtype.kind == "f":
+        with np.errstate(over="ignore"):
+            return np.asarray(stored == stored.dtype.type(mark))
+    return np.asarray(stored == mark)

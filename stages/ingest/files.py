@@ -8,7 +8,7 @@ from typing import BinaryIO
 
 from magtiles.schemas.errors import FormatError
 from magtiles.stages.ingest.geosoft import is_geosoft
-from magtiles.stages.ingest.xyz import is_xyz
+from magtiles.stages.ingest.xyz import is_xyz, odd_line
 
 _MAGIC = {
     b"II*\x00": "geotiff",
@@ -28,6 +28,9 @@ _KNOWN_OTHERS = {
     b"\xfd7zXZ": "xz-compressed",
     b"%PDF": "a PDF document",
     b"\x89PNG": "a PNG picture",
+    b"CDF\x05": "a netCDF file of format CDF-5, which nccopy -k nc4 converts",
+    b"\xff\xfe": "text in UTF-16",
+    b"\xfe\xff": "text in UTF-16",
 }
 _HEAD_BYTES = 65536
 
@@ -126,4 +129,8 @@ def _describe(head: bytes) -> str:
     start = head[:512].lstrip().lower()
     if start.startswith((b"<!doctype html", b"<html")):
         return "an HTML page"
-    return "binary data of an unknown kind" if b"\x00" in head[:512] else "text of an unknown kind"
+    if b"\x00" in head[:512]:
+        return "binary data of an unknown kind"
+    number, line = odd_line(head) or (1, head)
+    said = line.decode("latin-1").strip()[:50]
+    return f"text of an unknown kind: line {number}, '{said}', is no row of x, y and value"

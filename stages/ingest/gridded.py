@@ -20,7 +20,7 @@ from pyproj.exceptions import CRSError
 
 from magtiles.schemas.errors import FormatError, SourceError
 from magtiles.stages import crs as coordinates
-from magtiles.stages.ingest.axes import regular_axis, wrapped_longitudes
+from magtiles.stages.ingest.axes import regular_axis, unbroken_longitudes, wrapped_longitudes
 from magtiles.stages.ingest.cf_netcdf import read_cf
 from magtiles.stages.ingest.files import sniff
 from magtiles.stages.ingest.geosoft import read_geosoft
@@ -216,7 +216,8 @@ def regular(grid: GridFile[G]) -> RegularGrid:
             expected=f"{raw.y.size} rows x {raw.x.size} columns",
         )
     crs, metres = coordinates.in_metres(_settled_crs(grid))
-    x = regular_axis(raw.x, raw.x_ulp, where=f"{file} axis x") * metres
+    east = unbroken_longitudes(raw.x) if crs.is_geographic else raw.x
+    x = regular_axis(east, raw.x_ulp, where=f"{file} axis x") * metres
     y = regular_axis(raw.y, raw.y_ulp, where=f"{file} axis y") * metres
     columns, rows = np.arange(x.size), np.arange(y.size)
     if x[0] > x[-1]:

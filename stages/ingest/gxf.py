@@ -6,6 +6,7 @@ reads a truncated file as if whole and misplaces values when rows do not start o
 
 from __future__ import annotations
 
+import json
 import logging
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,9 @@ from magtiles.stages.ingest.raw import RawGrid, mark_voids
 from magtiles.stages.ingest.source import GridFileParams
 
 _LOG = logging.getLogger(__name__)
+
+_ONE_UNIT = 1e-6  # relative: US and international feet differ by twice that
+_SAME_RADIUS_M = 0.01  # an eccentricity of few digits
 
 _METRES = {
     "m": 1.0,
@@ -64,7 +68,10 @@ def read_gxf(path: Path, params: GridFileParams) -> RawGrid:
     says: dict[str, Any] = {"registration": "point"}
     if dummy is not None:
         says["no_data"] = dummy
-    return RawGrid(values * scale + offset, x, y, _crs(header, path), says=says)
+    crs = _crs(header, path)
+    if crs is None:
+        _check_unit(header, params.crs, path)
+    return RawGrid(values * scale + offset, x, y, crs, says=says)
 
 
 def _split(path: Path) -> tuple[dict[str, list[str]], str]:
@@ -178,15 +185,61 @@ def _crs(header: dict[str, list[str]], path: Path) -> pyproj.CRS | None:
     return _usgs_crs(header, path) if "PRJTYPE" in header else None
 
 
+def _check_unit(header: dict[str, list[str]], given: str | None, path: Path) -> None:
+    """Raise SourceError where the key `crs` counts in another unit than the file says."""
+    said = "".join(header.get("UNIT_LENGTH", [])).split(",")
+    if given is None or len(said) < 2 or not _is_number(said[1]):
+        return
+    try:
+        axis = pyproj.CRS.from_user_input(given).axis_info[0]
+    except (CRSError, IndexError):
+        return  # which is said where the CRS is used
+    metres = axis.unit_conversion_factor
+    if "degree" not in axis.unit_name and abs(float(said[1]) / metres - 1.0) > _ONE_UNIT:
+        raise SourceError(
+            f"key 'crs' is '{given}', which counts in {axis.unit_name} ({metres:g} m), but "
+            f"#UNIT_LENGTH is {', '.join(said[:2])}",
+            where=path,
+            remedy="state the CRS in the unit of the file, such as +units=us-ft",
+        )
+
+
 def _standard_crs(path: Path) -> pyproj.CRS | None:
     try:
         with rasterio.open(path, driver="GXF") as dataset:
             # GDAL leaves the zero meridian nameless, and PROJ then does not know the datum.
             wkt = dataset.crs.to_wkt().replace('PRIMEM["unnamed",0]', 'PRIMEM["Greenwich",0]')
-            return pyproj.CRS.from_wkt(wkt)
+            return _on_known_datum(pyproj.CRS.from_wkt(wkt))
     except (RasterioError, CRSError, AttributeError) as caught:  # no CRS at all is None
         _LOG.warning("%s: #MAP_PROJECTION is not understood (%s)", path.name, caught)
         return None
+
+
+def _on_known_datum(crs: pyproj.CRS) -> pyproj.CRS:
+    """The same projection on the datum that PROJ knows by the name the file gives."""
+    document = json.loads(crs.to_json())
+    base = document["base_crs"] if crs.is_projected else document
+    for name in (base["name"], base.get("datum", {}).get("name")):
+        try:
+            known = pyproj.CRS.from_user_input(str(name))
+        except CRSError:
+            continue
+        if known.is_geographic and _one_ellipsoid(crs, known):
+            found = json.loads(known.to_json())
+            base.pop("datum", None)
+            base |= {k: found[k] for k in ("datum", "datum_ensemble") if k in found}
+            return pyproj.CRS.from_json_dict(document)
+    return crs
+
+
+def _one_ellipsoid(first: pyproj.CRS, second: pyproj.CRS) -> bool:
+    one, other = first.ellipsoid, second.ellipsoid
+    return (
+        one is not None
+        and other is not None
+        and abs(one.semi_major_metre - other.semi_major_metre) < _SAME_RADIUS_M
+        and abs(one.semi_minor_metre - other.semi_minor_metre) < _SAME_RADIUS_M
+    )
 
 
 def _usgs_crs(header: dict[str, list[str]], path: Path) -> pyproj.CRS | None:

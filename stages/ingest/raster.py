@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import re
+import struct
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -44,12 +45,16 @@ def _check_ers_data(path: Path) -> None:
             remedy='name both in the source TOML: files = ["NAME.ers", "NAME"]',
         )
     cells = [_ers_number(header, key, path) for key in ("NrOfLines", "NrOfCellsPerLine")]
-    kind = re.search(r"CellType\s*=\s*(?:IEEE|Signed|Unsigned)(\d)Byte", header)
+    kind = re.search(r"CellType\s*=\s*(?:IEEE(\d)Byte|(?:Signed|Unsigned)(\d+)Bit)", header)
     if kind is None:
         raise FormatError("CellType is missing", where=path, expected="such as IEEE4ByteReal")
+    value_bytes = int(kind[1]) if kind[1] else int(kind[2]) // 8
+    turned = re.search(r"\bRotation\s*=\s*([-+\d:.]+)", header)
+    if turned and turned[1].strip("-+0:."):
+        raise _rotated(path, f"by {turned[1]} degrees")  # GDAL does not look at it
     offset = _ers_number(header, "HeaderOffset", path, 0)
     bands = _ers_number(header, "NrOfBands", path, 1)
-    wanted = offset + cells[0] * cells[1] * bands * int(kind[1])
+    wanted = offset + cells[0] * cells[1] * bands * value_bytes
     if data.stat().st_size < wanted:
         raise FormatError(
             f"holds {data.stat().st_size} bytes",
@@ -57,6 +62,26 @@ def _check_ers_data(path: Path) -> None:
             expected=f"{wanted}, as {path.name} says",
             remedy="the file is truncated: fetch it again",
         )
+
+
+def _check_surfer_7(path: Path) -> None:
+    """Raise FormatError where a Surfer 7 grid is rotated, which GDAL does not look at."""
+    with path.open("rb") as file:
+        head = file.read(1 << 16)
+    place = head.find(b"GRID") + 8  # tag and size, then rows, columns and eight doubles
+    if place >= 8 and place + 72 <= len(head):
+        (angle,) = struct.unpack_from("<d", head, place + 56)
+        if angle != 0.0:
+            raise _rotated(path, f"by {angle:g} degrees")
+
+
+def _rotated(path: Path, how: str) -> FormatError:
+    return FormatError(
+        f"the raster is rotated {how}",
+        where=path,
+        expected="rows along x and columns along y",
+        remedy="resample it to an unrotated grid of its projection",
+    )
 
 
 def _ers_number(header: str, key: str, path: Path, default: int | None = None) -> int:
@@ -83,7 +108,7 @@ _FORMATS = {
     "geotiff": _Format("GTiff", "GeoTIFF", check_tiff_directories),
     "surfer-6-text": _Format("GSAG", "Surfer 6 text grid"),
     "surfer-6": _Format("GSBG", "Surfer 6 grid"),
-    "surfer-7": _Format("GS7BG", "Surfer 7 grid"),
+    "surfer-7": _Format("GS7BG", "Surfer 7 grid", _check_surfer_7),
     "er-mapper": _Format("ERS", "ER Mapper grid", _check_ers_data),
     "esri-ascii": _Format("AAIGrid", "ESRI ASCII grid", from_memory=True),
 }
@@ -107,12 +132,19 @@ def read_raster(kind: str, path: Path, params: GridFileParams) -> RawGrid:
             with _opened(path, form) as dataset:
                 return _read(dataset, path, params)
     except RasterioError as caught:
-        detail = caught.__cause__ or caught
         raise FormatError(
-            f"is not a whole {form.name}: {str(detail).replace(str(path), path.name)}",
+            f"is not a whole {form.name}: {_detail(caught, path)}",
             where=path,
             remedy="fetch it again",
         ) from None
+
+
+def _detail(caught: RasterioError, path: Path) -> str:
+    """What GDAL says, in one line, by the file's own name and not that of its copy in memory."""
+    said = " ".join(str(caught.__cause__ or caught).split()).rstrip(".")
+    return re.sub(r"[0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12}\.\w+", path.name, said).replace(
+        str(path), path.name
+    )
 
 
 @contextlib.contextmanager
@@ -168,12 +200,7 @@ def _nodes(dataset: Any, path: Path) -> tuple[NDArray[np.float64], NDArray[np.fl
             expected="one that states a corner and the size of its cells",
         )
     if transform.b or transform.d:
-        raise FormatError(
-            f"the raster is rotated or sheared (b = {transform.b:g}, d = {transform.d:g})",
-            where=path,
-            expected="rows along x and columns along y",
-            remedy="resample it to an unrotated grid of its projection",
-        )
+        raise _rotated(path, f"or sheared (b = {transform.b:g}, d = {transform.d:g})")
     x = transform.c + transform.a * (np.arange(dataset.width) + 0.5)
     y = transform.f + transform.e * (np.arange(dataset.height) + 0.5)
     return x, y

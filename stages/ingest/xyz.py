@@ -3,30 +3,43 @@
 from __future__ import annotations
 
 import re
+from codecs import BOM_UTF8
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyproj
 from numpy.typing import NDArray
+from pyproj.exceptions import CRSError
 
 from magtiles.schemas.errors import FormatError, SourceError
 from magtiles.stages.ingest.raw import RawGrid, mark_voids
 from magtiles.stages.ingest.source import GridFileParams
 
-_NUMBER = re.compile(rb"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|nan", re.IGNORECASE)
+_NUMBER = re.compile(rb"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|nan|\*", re.IGNORECASE)
+_DUMMY = "*"  # Geosoft's, in text
+_COMMENT = b"#>/"  # GMT's and Geosoft's
 _OFF_NODE = 0.05  # of a step
 _LARGEST = 1 << 31  # nodes
 
 
 def is_xyz(head: bytes) -> bool:
     """Whether text consists, after comments and at most one line of names, of rows of numbers."""
-    if b"\x00" in head:
-        return False
-    lines = [line for line in head.splitlines() if line.strip() and line.lstrip()[:1] not in b"#>"]
+    return b"\x00" not in head and odd_line(head) is None
+
+
+def odd_line(head: bytes) -> tuple[int, bytes] | None:
+    """Number and text of the first line of 50 that should be a row of numbers and is none."""
+    lines = [
+        (number, line)
+        for number, line in enumerate(head.splitlines(), start=1)
+        if line.strip() and line.lstrip()[:1] not in _COMMENT
+    ]
     complete = lines[:-1] or lines
-    if len(complete) > 1 and not _numbers(complete[0]):
+    if len(complete) > 1 and not _numbers(complete[0][1]):
         complete = complete[1:]
-    return bool(complete) and all(_numbers(line) >= 3 for line in complete[:50])
+    odd = [(number, line) for number, line in complete[:50] if _numbers(line) < 3]
+    return odd[0] if odd else None if complete else (1, head[:50])
 
 
 def _numbers(line: bytes) -> int:
@@ -36,7 +49,7 @@ def _numbers(line: bytes) -> int:
 
 
 def _words(line: bytes) -> list[bytes]:
-    return [word for word in re.split(rb"[\s,;]+", line.strip()) if word]
+    return [word for word in re.split(rb"[\s,;]+", line.removeprefix(BOM_UTF8).strip()) if word]
 
 
 def read_xyz(path: Path, params: GridFileParams) -> RawGrid:
@@ -47,6 +60,8 @@ def read_xyz(path: Path, params: GridFileParams) -> RawGrid:
     """
     _refuse_cut(path)
     table, first_line = _table(path, list(params.all_columns))
+    if _geographic(params.crs):
+        table[:, 0] = _in_one_piece(table[:, 0])
     x, columns_of = _axis(table[:, 0], path, first_line, "x")
     y, rows_of = _axis(table[:, 1], path, first_line, "y")
     if x.size * y.size > _LARGEST or x.size * y.size > 64 * len(table) + 64:
@@ -86,9 +101,11 @@ def _table(path: Path, columns: list[int]) -> tuple[NDArray[np.float64], int]:
             skiprows=skipped,
             usecols=sorted({c - 1 for c in columns}),
             comment="#",
+            na_values=[_DUMMY],
             dtype=np.float64,
             skipinitialspace=True,
-            encoding="latin-1",
+            encoding="utf-8-sig",
+            encoding_errors="replace",
         )
     except (ValueError, pd.errors.ParserError) as caught:
         raise FormatError(f"a line is not numbers: {caught}", where=path) from None
@@ -125,6 +142,24 @@ def _refuse_cut(path: Path) -> None:
             expected=f"{len(_words(first))}, as the first has",
             remedy="the file is truncated: fetch it again",
         )
+
+
+def _geographic(crs: str | None) -> bool:
+    try:
+        return crs is not None and pyproj.CRS.from_user_input(crs).is_geographic
+    except CRSError:
+        return False  # which is said where the CRS is used
+
+
+def _in_one_piece(longitude: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Longitudes of a region across the date line count on above 180, degrees."""
+    distinct = np.unique(longitude)
+    turn = 360.0 - (distinct[-1] - distinct[0])
+    steps = np.diff(distinct)
+    if steps.size == 0 or steps.max() <= max(turn, 180.0):
+        return longitude
+    east = distinct[np.argmax(steps) + 1]
+    return np.where(longitude < east, longitude + 360.0, longitude)
 
 
 def _axis(
