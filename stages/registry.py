@@ -12,6 +12,7 @@ from magtiles.stages.field import (
     evaluate_model,
     model_components,
     rereference,
+    sphere,
     surface,
     voids,
 )
@@ -64,6 +65,7 @@ STAGES: tuple[Stage, ...] = (
     continuation.STAGE,
     components.STAGE,
     model_components.STAGE,
+    sphere.STAGE,
     surface.STAGE,
     tiles.STAGE,
 )

@@ -12,7 +12,7 @@ from magtiles.stages.field.at_nodes import evaluate_products, quality_flags
 from magtiles.stages.field.blocks import Block
 from magtiles.stages.field.direction import Ambient, AmbientSource
 from magtiles.stages.field.large import LargeLevel, is_large, strips
-from magtiles.stages.field.level import assemble_level, mean_angles, wgs84_variable
+from magtiles.stages.field.level import OF_DATUM, assemble_level, mean_angles, wgs84_variable
 from magtiles.stages.field.padding import plan_padding
 from magtiles.stages.field.prepare import prepare
 from magtiles.stages.field.reuse import content_key, latest
@@ -23,8 +23,6 @@ from magtiles.stages.field.uncertainty import budget, survey_variance
 from magtiles.stages.field.windows import MapWindows
 
 Single = NDArray[np.float32]
-
-_DROPPED = ("datum_pipeline", "datum_operation", "datum_accuracy_m", "allow_ballpark_datum")
 
 
 class DeriveComponentsParams(Params):
@@ -195,7 +193,7 @@ def _assemble(
         flags,
         height=xr.Variable((), float(height) + height_gain, height.attrs),
         crs=grid["crs"].variable if planar else wgs84_variable(),
-        attributes={k: v for k, v in grid.attrs.items() if k not in _DROPPED or planar},
+        attributes={k: v for k, v in grid.attrs.items() if k not in OF_DATUM or planar},
     )
     if (surface := surface_at(grid, target)) is not None:
         level["reference_surface_height"] = surface

@@ -19,6 +19,9 @@ PRODUCTS = (
     "magnetic_anomaly", "anomaly_north", "anomaly_east", "anomaly_down",
     "gradient_nn", "gradient_ne", "gradient_nd", "gradient_ee", "gradient_ed",
 )  # fmt: skip
+OF_DATUM = ("datum_pipeline", "datum_operation", "datum_accuracy_m", "allow_ballpark_datum")
+"""Attributes of a survey's own CRS that do not hold for a level in WGS84."""
+
 SIGMAS = {
     "magnetic_anomaly_uncertainty": "total",
     "vector_uncertainty": "vector",

@@ -6,7 +6,7 @@ a border. The total is |core + crust| - |core|, as a magnetometer would measure 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +20,8 @@ from magtiles.schemas.errors import ParameterError
 from magtiles.stages.declare import FILES, OPTIONAL_FILE, IsoDate, Params, Stage, quantity
 from magtiles.stages.field.direction import Ambient
 from magtiles.stages.field.evaluate_model import Axis
-from magtiles.stages.field.level import PRODUCTS, assemble_level, wgs84_variable
+from magtiles.stages.field.harmonic_nodes import Circle, crust_products
+from magtiles.stages.field.level import assemble_level, wgs84_variable
 from magtiles.stages.field.model_parts import ModelParts, split_model
 from magtiles.stages.field.model_uncertainty import ModelError
 from magtiles.stages.field.reuse import latest
@@ -33,11 +34,7 @@ LOWEST_LAND_M = -600.0
 """Below any dry land (the Dead Sea's shore, 430 m below a geoid up to 107 m below the
 ellipsoid): lower levels are under water or rock, nearer the sources than a model's data."""
 
-_NODES_AT_ONCE = 2_000_000
-"""Field and tensor of so many nodes take 200 MB in double precision."""
-
 _AROUND_M = 2.0 * np.pi * 6_371_200.0
-_TENSOR = {"nn": (0, 0), "ne": (0, 1), "nd": (0, 2), "ee": (1, 1), "ed": (1, 2)}
 
 
 class ModelPartsParams(Params):
@@ -152,13 +149,14 @@ def _products(
     longitude: Real,
     params: ModelComponentsParams,
 ) -> tuple[Single, Ambient]:
-    """The nine products (9, m, n), and the core field's direction, in bands of latitude."""
-    shape = len(latitude), len(longitude)
-    # What is a whole turn apart is the same place, and must be the same to the bit.
-    turn = round(360.0 / params.longitude[1])
-    whole = len(longitude) > turn and abs(turn * params.longitude[1] - 360.0) < 1e-9
-    circle = longitude[:turn] if whole else longitude
-    again = np.arange(len(longitude)) % len(circle)
+    """The nine products (9, m, n), and the core field's direction."""
+
+    def along(latitudes: Real, longitudes: Real, vector: Real) -> tuple[Real, Real]:
+        place = latitudes, longitudes, [params.height_m]
+        core = evaluate_grid(parts.core, *place, params.reference_epoch)[0]
+        strength = np.linalg.norm(core, axis=-1)
+        return _total(core, strength, vector), core / strength[..., None]
+
     static = replace(
         parts.crust,
         epochs=np.zeros(1),
@@ -166,25 +164,8 @@ def _products(
         secular_variation=None,
         valid=(-np.inf, np.inf),
     )
-    products = np.empty((len(PRODUCTS), *shape), np.float32)
-    ambient = np.empty((3, *shape), np.float32)
-    for band in _bands(*shape):
-        place = latitude[band], circle, [params.height_m]
-        vector, tensor = evaluate_grid(static, *place, 0.0, gradient=True)
-        core = evaluate_grid(parts.core, *place, params.reference_epoch)
-        strength = np.linalg.norm(core[0], axis=-1)
-        total = _total(core[0], strength, vector[0])
-        ambient[:, band] = np.moveaxis(core[0] / strength[..., None], -1, 0)[..., again]
-        products[0, band] = total[:, again]
-        products[1:4, band] = np.moveaxis(vector[0], -1, 0)[..., again]
-        for out, (i, j) in zip(products[4:], _TENSOR.values(), strict=True):
-            out[band] = tensor[0, ..., i, j][:, again]
-    return products, Ambient(*ambient)
-
-
-def _bands(rows: int, columns: int) -> Iterator[slice]:
-    step = max(1, _NODES_AT_ONCE // columns)
-    return (slice(start, min(start + step, rows)) for start in range(0, rows, step))
+    circle = Circle.of(longitude, params.longitude[1])
+    return crust_products(static, latitude, circle, params.height_m, along)
 
 
 def _total(core: Real, strength: Real, crust: Real) -> Real:

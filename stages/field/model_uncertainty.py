@@ -25,7 +25,7 @@ from magtiles.catalog.models import FieldModel, power_spectrum
 
 Real = NDArray[np.float64]
 
-_SHALLOWEST_M = 2000.0
+SHALLOWEST_M = 2000.0
 """Least depth of the omitted sources: half of what water and sediment amount to on average."""
 
 _NEAREST_M = 1000.0
@@ -33,7 +33,7 @@ _NEAREST_M = 1000.0
 
 _LOWEST_DEGREES = 3
 _E_FOLDINGS = 40.0
-_STORED_OF_TENSOR = 3.0 / 32.0
+STORED_OF_TENSOR = 3.0 / 32.0
 """Mean square of the five stored components, of the sum of all nine squared.
 
 For plane waves of any azimuth, which the field is at degrees above ten: nn and ee have 3/32 of the
@@ -77,23 +77,15 @@ class ModelError:
         return {
             "total": np.sqrt(down * steep + horizontal * (1.0 - steep)),
             "vector": np.broadcast_to(np.sqrt(vector), steep.shape),
-            "tensor": np.broadcast_to(np.sqrt(_STORED_OF_TENSOR * tensor), steep.shape),
+            "tensor": np.broadcast_to(np.sqrt(STORED_OF_TENSOR * tensor), steep.shape),
         }
 
     def _variances(self, height_m: float) -> tuple[float, float, float]:
         """Mean squares: down, north (or east), and the sum of all squares of the tensor."""
-        down = horizontal = tensor = 0.0
-        nearest = _NEAREST_M - _SHALLOWEST_M
-        for (n, power), height in (
-            (self._commission, height_m),
-            (self._omission, max(height_m, nearest)),
-        ):
-            radius_km = self._radius_km + height / 1000.0
-            lifted = power * (self._radius_km / radius_km) ** (2.0 * n + 4.0)
-            down += float(np.sum(lifted * (n + 1) / (2 * n + 1)))
-            horizontal += float(np.sum(lifted * n / (4 * n + 2)))
-            # The Laplacian of |B|^2, which goes as r^-(2n + 4), is twice the sum of squares.
-            tensor += float(np.sum(lifted * (n + 2) * (2.0 * n + 3.0))) / radius_km**2
+        commission = field_variances(*self._commission, height_m, self._radius_km)
+        height = max(height_m, _NEAREST_M - SHALLOWEST_M)
+        omission = field_variances(*self._omission, height, self._radius_km)
+        down, horizontal, tensor = (a + b for a, b in zip(commission, omission, strict=True))
         return down, horizontal, tensor
 
     @property
@@ -106,6 +98,23 @@ class ModelError:
                 ("omission", self._omission),
             )
         }
+
+
+def field_variances(
+    n: NDArray[np.int_], power: Real, height_m: float, radius_km: float
+) -> tuple[float, float, float]:
+    """Mean squares over the globe of a field whose degrees `n` have `power` at `radius_km`.
+
+    Down, north (or east), and the sum of all squares of the tensor, nT^2 and nT^2/km^2.
+    """
+    radius = radius_km + height_m / 1000.0
+    lifted = power * (radius_km / radius) ** (2.0 * n + 4.0)
+    # The Laplacian of |B|^2, which goes as r^-(2n + 4), is twice the sum of squares.
+    return (
+        float(np.sum(lifted * (n + 1) / (2 * n + 1))),
+        float(np.sum(lifted * n / (4 * n + 2))),
+        float(np.sum(lifted * (n + 2) * (2.0 * n + 3.0))) / radius**2,
+    )
 
 
 def _omission(
@@ -122,7 +131,7 @@ def _omission(
 
 def _exponential(n: NDArray[np.int_], power: Real, radius_km: float) -> tuple[float, float]:
     """Power at the highest degree, and its ratio from one degree to the next."""
-    steepest = ((radius_km - _SHALLOWEST_M / 1000.0) / radius_km) ** 2
+    steepest = ((radius_km - SHALLOWEST_M / 1000.0) / radius_km) ** 2
     upper = (n >= n[-1] / 2) & (power > 0.0)
     if np.count_nonzero(upper) < _LOWEST_DEGREES:
         return float(power.mean()), steepest

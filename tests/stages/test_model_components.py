@@ -15,7 +15,7 @@ from magtiles.catalog.models import cof_text, evaluate_grid, load_igrf, power_sp
 from magtiles.pipeline.sample_model import WorldSpec, world_model
 from magtiles.schemas import contracts
 from magtiles.schemas.errors import ParameterError
-from magtiles.stages.field import model_components
+from magtiles.stages.field import harmonic_nodes
 from magtiles.stages.field.level import PRODUCTS
 from magtiles.stages.field.model_components import (
     ModelComponentsParams,
@@ -69,7 +69,7 @@ def test_tensor_is_the_models_own(file):
     made = level(file)
     crust = MODEL.degrees(16, 48)
     _, tensor = evaluate_grid(crust, made.latitude, made.longitude, 3000.0, EPOCH, gradient=True)
-    for name, (i, j) in model_components._TENSOR.items():
+    for name, (i, j) in harmonic_nodes.TENSOR_PARTS.items():
         found = made[f"gradient_{name}"].values
         np.testing.assert_allclose(found, tensor[0, ..., i, j], rtol=2e-7, atol=1e-9)
 
@@ -85,7 +85,7 @@ def test_a_whole_turn_is_the_same_to_the_bit(file, step):
 
 def test_bands_of_latitude_do_not_show(file, monkeypatch):
     whole = level(file)
-    monkeypatch.setattr(model_components, "_NODES_AT_ONCE", 10)
+    monkeypatch.setattr(harmonic_nodes, "_NODES_AT_ONCE", 10)
     for name in PRODUCTS:
         np.testing.assert_array_equal(level(file)[name], whole[name])
 
@@ -175,7 +175,7 @@ def test_omission_is_what_the_model_lacks(height):
     unit = core / np.linalg.norm(core, axis=-1, keepdims=True)
     sigma = error.sigmas(height, unit[..., 2])
     total = np.einsum("...i,...i->...", lost[0], unit)
-    five = np.stack([slope[0, ..., i, j] for i, j in model_components._TENSOR.values()], -1)
+    five = np.stack([slope[0, ..., i, j] for i, j in harmonic_nodes.TENSOR_PARTS.values()], -1)
     for group, found in (("total", total), ("vector", lost[0]), ("tensor", five)):
         stated = np.sqrt(np.mean(sigma[group] ** 2))
         assert np.sqrt(np.mean(found**2)) == pytest.approx(stated, rel=0.15), group
@@ -199,7 +199,7 @@ def test_shares_of_the_components():
     assert np.sqrt(np.mean(field[..., :2] ** 2)) == pytest.approx(flat, rel=0.04)
     assert np.sqrt(np.mean(field**2)) == pytest.approx(float(
         error.sigmas(0.0, np.array(0.0))["vector"]), rel=0.04)  # fmt: skip
-    five = np.stack([tensor[..., i, j] for i, j in model_components._TENSOR.values()], -1)
+    five = np.stack([tensor[..., i, j] for i, j in harmonic_nodes.TENSOR_PARTS.values()], -1)
     stated = float(error.sigmas(0.0, np.array(0.0))["tensor"])
     assert np.sqrt(np.mean(five**2)) == pytest.approx(stated, rel=0.05)
 
