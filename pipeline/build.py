@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,12 +17,16 @@ from magtiles.pipeline.progress import Progress, silent
 from magtiles.pipeline.roads_part import build_roads
 from magtiles.pipeline.steps import MapPlan, PartResult, Steps
 from magtiles.pipeline.survey_map import plan_survey_map
-from magtiles.pipeline.tasks import Workplace, working
+from magtiles.pipeline.tasks import SCRATCH, Workplace, working
 from magtiles.pipeline.temporal_part import build_temporal
 from magtiles.schemas.errors import CoverageError, MagtilesError, ParameterError, SourceError
+from magtiles.stages.release.atomic import remove_temporaries
+from magtiles.stages.release.lock import locked
 from magtiles.stages.release.provenance import resource, slsa_predicate
 from magtiles.stages.release.publish import PublishResult, publish_release
 from magtiles.stages.release.records import MeasuredTile
+
+_LOCK_NAME = ".build.lock"
 
 
 def build_product(
@@ -48,10 +53,29 @@ def build_product(
     Raises MagtilesError subclasses for bad sources, data, parameters and versions.
     """
     wanted = load_product(product)
-    for folder in (store, work):
-        _check_writable(folder)
-    with _asked_by(product):
-        return _build(wanted, store, work, data, progress, scheduler)
+    folder = work / wanted.product.name
+    for written in (store / wanted.product.name, folder):
+        _check_writable(written)
+    with _asked_by(product), _alone_in(folder):
+        return _build(wanted, store, folder, data, progress, scheduler)
+
+
+@contextlib.contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """One build at a time in a folder, without what those leave that die."""
+    with locked(folder, _LOCK_NAME, doing="building"):
+        _sweep(folder)
+        yield
+        _sweep(folder)
+        for blocks in folder.glob("*.blocks"):  # of a build that was killed when it had them all
+            shutil.rmtree(blocks, ignore_errors=True)
+
+
+def _sweep(folder: Path) -> None:
+    """Remove temporary files, of this build's dead workers too, and a dead cluster's own."""
+    for inner, _, _ in os.walk(folder):
+        remove_temporaries(Path(inner))
+    shutil.rmtree(folder / SCRATCH, ignore_errors=True)
 
 
 def _check_writable(folder: Path) -> None:
@@ -81,12 +105,11 @@ def _asked_by(product: Path) -> Iterator[None]:
 def _build(
     wanted: Product,
     store: Path,
-    work: Path,
+    folder: Path,
     data: Path | None,
     progress: Progress,
     scheduler: str | None,
 ) -> PublishResult:
-    folder = work / wanted.product.name
     more = 0 if wanted.temporal is None else wanted.temporal.steps
     if isinstance(wanted.map, SurveyMap) and wanted.map.surface is not None:
         more += wanted.map.surface.steps

@@ -8,6 +8,7 @@ import gc
 import importlib.metadata
 import logging
 import secrets
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,6 +25,10 @@ Value = TypeVar("Value")
 _WORKER_BYTES = 2 << 30
 """Memory that one worker may need: a block of a large map, with what Python itself takes."""
 _PATIENCE_S = 30
+_STARTS = 3
+_WORKERS_DIE = "check memory; a script that builds must do so below if __name__ == '__main__':"
+SCRATCH = ".cluster"
+"""Name of the folder of a local cluster's own files, in the build's folder."""
 
 
 @dataclass
@@ -102,7 +107,7 @@ def working(scheduler: str | None, shared: Path) -> Iterator[Workplace]:
     MagtilesError if not, UsageError where there is none at the address.
     """
     with contextlib.ExitStack() as opened, concurrent.futures.ThreadPoolExecutor(1) as starter:
-        place = Workplace(Tasks(), opened, starter)
+        place = Workplace(Tasks(), shared, opened, starter)
         if scheduler is not None:
             opened.enter_context(_garbage_collected_here())
             client = opened.enter_context(_connected(scheduler))
@@ -118,6 +123,7 @@ class Workplace:
     """Tasks, and what it takes to give them a local cluster."""
 
     tasks: Tasks
+    _shared: Path
     _opened: contextlib.ExitStack
     _starter: concurrent.futures.Executor
 
@@ -125,7 +131,7 @@ class Workplace:
         """Have a local cluster, of a process per core, unless there is one; it starts meanwhile."""
         if not self.tasks.in_cluster:
             self._opened.enter_context(_garbage_collected_here())
-            cluster = _local_cluster()
+            cluster = _local_cluster(self._shared / SCRATCH)
             self.tasks.use(self._starter.submit(self._opened.enter_context, cluster))
 
 
@@ -146,24 +152,43 @@ def _garbage_collected_here() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _local_cluster() -> Iterator[distributed.Client]:
-    """A process per core, as far as memory goes round; a process that dies is replaced."""
+def _local_cluster(scratch: Path) -> Iterator[distributed.Client]:
+    """A process per core, as far as memory goes round; a process that dies is replaced.
+
+    What its workers keep for themselves is in the folder `scratch`, for as long as they live.
+    """
+    import dask
+    import distributed
+
+    try:
+        with (
+            dask.config.set({"temporary-directory": str(scratch.absolute())}),
+            _started_cluster() as cluster,
+            contextlib.closing(distributed.Client(cluster, set_as_default=False)) as client,
+        ):
+            yield client
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def _started_cluster() -> distributed.LocalCluster:
+    """Raises MagtilesError where its workers die while they start, again and again."""
     import distributed
     from dask.system import CPU_COUNT
     from distributed.system import MEMORY_LIMIT
 
-    count = max(1, min(CPU_COUNT, MEMORY_LIMIT // _WORKER_BYTES))
-    with (
-        distributed.LocalCluster(
-            n_workers=count,
-            threads_per_worker=1,
-            dashboard_address="127.0.0.1:0",
-            memory_limit=0,
-            silence_logs=logging.CRITICAL,
-        ) as cluster,
-        contextlib.closing(distributed.Client(cluster, set_as_default=False)) as client,
-    ):
-        yield client
+    for _ in range(_STARTS):
+        try:
+            return distributed.LocalCluster(
+                n_workers=max(1, min(CPU_COUNT, MEMORY_LIMIT // _WORKER_BYTES)),
+                threads_per_worker=1,
+                dashboard_address="127.0.0.1:0",
+                memory_limit=0,
+                silence_logs=logging.CRITICAL,
+            )
+        except RuntimeError as caught:  # it replaces only workers that have once been there
+            failed = caught
+    raise MagtilesError(f"no local cluster can be started ({failed})", remedy=_WORKERS_DIE)
 
 
 @contextlib.contextmanager
@@ -201,7 +226,7 @@ def _check_workers(client: distributed.Client, shared: Path) -> None:
             "a worker has no magtiles", where=client.scheduler.address, remedy="install it there"
         ) from caught
     shared.mkdir(parents=True, exist_ok=True)
-    token = shared.absolute() / f".shared-{secrets.token_hex(8)}.tmp"
+    token = shared.absolute() / f".shared.{secrets.token_hex(8)}.tmp"
     token.write_text(token.name, encoding="utf-8")
     try:
         found = client.run(_describe_worker, token)
@@ -244,7 +269,7 @@ def _result(future: Any) -> Any:
     except distributed.KilledWorker as caught:
         raise MagtilesError(
             f"workers died again and again ({caught})",
-            remedy="check memory; a script that builds must do so below if __name__ == '__main__':",
+            remedy=_WORKERS_DIE,
         ) from caught
     except concurrent.futures.CancelledError as caught:
         raise MagtilesError(

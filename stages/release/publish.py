@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 import socket
+import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -35,8 +36,9 @@ from magtiles.catalog.releases.versions import (
 )
 from magtiles.schemas import contracts
 from magtiles.schemas.errors import ContractError, SourceError, VersionError
-from magtiles.stages.release.atomic import sync, write_bytes
+from magtiles.stages.release.atomic import remove_temporaries, sync, write_bytes, writing
 from magtiles.stages.release.checks import CHECKS_NAME, make_checks, replay_checks
+from magtiles.stages.release.lock import locked
 from magtiles.stages.release.provenance import CONTRACT as PROVENANCE_CONTRACT
 from magtiles.stages.release.provenance import build_date, statement
 from magtiles.stages.release.records import (
@@ -52,6 +54,9 @@ LATEST_NAME = "latest.json"
 PROVENANCE_NAME = "provenance.json"
 
 _STAGING = ".staging."
+_LOCK_NAME = ".publish.lock"
+_DEAD_S = 86400.0
+"""Age after which what another machine left of a release is dead; publishing takes minutes."""
 _EXTRA_ROLES = {
     r"preview/[A-Za-z0-9_-][A-Za-z0-9._-]*": "preview",
     r"core_field\.shc": "core_field",
@@ -106,23 +111,22 @@ def publish_release(
     if not re.fullmatch(NAME, product):
         raise SourceError(f"'{product}' is no product name", expected=f"letters like {NAME}")
     parse_version(version)
-    home = store / product
-    home.mkdir(parents=True, exist_ok=True)
-    _remove_dead_staging(home)
     measured = [measure_tile(t) if isinstance(t, Path) else t for t in tiles]
     measured.sort(key=lambda t: str(t.entry["path"]))
     document = _document(product, version, measured, identity, inputs)
     extras = {path: _extra(path, file) for path, file in sorted(extra_files.items())}
-    final = home / version
     _add_files(document, extras)
     if TEMPORAL_PATH in extra_files:
         _add_temporal(document, extra_files)
     for path in (path for path in extra_files if re.fullmatch(ROAD_PATH, path)):
         _complete_entry(document, measure_road(extra_files[path], path), extra_files[path])
-    changed = not _exists_already(home, _sealed(document))
-    if changed:
-        _build(home, final, document, measured, extras, provenance)
-    _point_to_latest(home)
+    home, final = store / product, store / product / version
+    with writing(final), locked(home, _LOCK_NAME, doing="publishing"):
+        _remove_dead(home)
+        changed = not _exists_already(home, _sealed(document))
+        if changed:
+            _build(home, final, document, measured, extras, provenance)
+        _point_to_latest(home)
     return PublishResult(final, changed)
 
 
@@ -294,7 +298,7 @@ def _copy(tile: MeasuredTile, staging: Path) -> None:
 
 def _complete(staging: Path, document: dict[str, Any], provenance: Mapping[str, Any]) -> None:
     """Add checks, provenance and the final manifest, then read the release back and try it."""
-    write_bytes(staging / MANIFEST_NAME, _seal(document))
+    (staging / MANIFEST_NAME).write_bytes(_seal(document))
     checks = canonical_json(make_checks(open_release(staging)))
     (staging / CHECKS_NAME).write_bytes(checks)
     _add_files(document, {CHECKS_NAME: checks})
@@ -302,7 +306,7 @@ def _complete(staging: Path, document: dict[str, Any], provenance: Mapping[str, 
     (staging / PROVENANCE_NAME).write_bytes(made)
     _add_files(document, {PROVENANCE_NAME: made})
     contracts.check_document(json.loads(_seal(document)), CONTRACT, where=MANIFEST_NAME)
-    write_bytes(staging / MANIFEST_NAME, _seal(document))
+    (staging / MANIFEST_NAME).write_bytes(_seal(document))
     replay_checks(open_release(staging))
 
 
@@ -334,11 +338,14 @@ def _rename(staging: Path, final: Path) -> None:
         ) from None
 
 
-def _remove_dead_staging(home: Path) -> None:
-    """Remove what a killed build left; a living process, or another machine, keeps its own."""
-    for folder in home.glob(f"{_STAGING}{socket.gethostname()}.*"):
-        pid = folder.name.rpartition(".")[2]
-        if pid.isdigit() and not _alive(int(pid)):
+def _remove_dead(home: Path) -> None:
+    """Remove what killed builds left; a living process, or another machine, keeps its own."""
+    remove_temporaries(home)
+    here = f"{_STAGING}{socket.gethostname()}."
+    for folder in home.glob(f"{_STAGING}*"):
+        pid = folder.name.removeprefix(here)
+        ended = pid.isdigit() and not _alive(int(pid))
+        if ended or time.time() - folder.stat().st_mtime > _DEAD_S:
             _remove(folder)
 
 

@@ -24,11 +24,13 @@ from magtiles.schemas.errors import (
     ContractError,
     FormatError,
     IntegrityError,
+    MagtilesError,
     SourceError,
     VersionError,
 )
 from magtiles.stages.release import publish as publish_module
 from magtiles.stages.release.checks import make_checks, replay_checks
+from magtiles.stages.release.lock import locked
 from magtiles.stages.release.publish import published_versions
 
 LATTICE = replace(small_lattice(), rows=30, columns=34)
@@ -189,7 +191,7 @@ def test_an_error_on_the_way_leaves_nothing(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(publish_module, "_protect", full_disk)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(MagtilesError, match=r"1\.0\.0: cannot be written \(No space left.*free"):
         world.publish(tmp_path, tiles=tiles)
     assert list((tmp_path / "demo").iterdir()) == []
 
@@ -205,6 +207,40 @@ def test_the_staging_of_a_living_build_is_left_alone(
     world.publish(tmp_path, tiles=tiles)
     assert alive.is_dir()
     assert elsewhere.is_dir()
+    os.utime(elsewhere, (0, 0))
+    world.publish(tmp_path, tiles=tiles)
+    assert alive.is_dir()
+    assert not elsewhere.exists()
+
+
+PUBLISH = """
+import sys
+sys.path.insert(0, sys.argv[1])
+from pathlib import Path
+from synthetic_release import World
+tiles = sorted(Path(sys.argv[3]).glob("*.nc"))
+print(World(heights=(0.0, 1000.0)).publish(Path(sys.argv[2]), tiles=tiles).changed)
+"""
+
+
+def test_of_two_at_once_one_publishes_and_the_other_waits(
+    world: World, tiles: list[Path], tmp_path: Path
+) -> None:
+    truth = Path(sys.modules["synthetic_release"].__file__ or "").parent
+    home = tmp_path / "demo"
+    command = [sys.executable, "-c", PUBLISH, str(truth), str(tmp_path), str(tiles[0].parent)]
+    with locked(home, ".publish.lock", doing="publishing"):
+        both = [
+            subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+            for _ in range(2)
+        ]
+        for process in both:
+            assert process.stderr is not None
+            told = process.stderr.readline()
+            assert told == f"another process is publishing in {home}: waiting for it\n"
+        assert [path.name for path in home.iterdir()] == [".publish.lock"]
+    assert sorted(process.communicate()[0] for process in both) == ["False\n", "True\n"]
+    assert sorted(p.name for p in home.iterdir()) == ["1.0.0", "latest.json"]
 
 
 def test_losing_a_race_is_an_error_that_says_so(
@@ -230,7 +266,7 @@ def test_tiles_that_do_not_fit_together_are_refused(
     strange = World(lattice=LATTICE, heights=(0.0, 2000.0)).write_tiles(tmp_path / "strange")
     with pytest.raises(ContractError, match="height is"):
         world.publish(tmp_path, tiles=[*tiles[:-1], strange[-1]])
-    assert list((tmp_path / "demo").iterdir()) == []
+    assert not (tmp_path / "demo").exists()
 
 
 def test_a_tile_off_the_lattice_is_refused(world: World, tiles: list[Path], tmp_path: Path) -> None:
