@@ -45,7 +45,8 @@ build/sample/demo.toml build/sample/world.toml: pipeline/sample.py pipeline/samp
 
 test: $(READY) ## Run the tests
 	@# Small maps: waking threads for them would cost more than they save.
-	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/pytest
+	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses=logical --maxprocesses=8 \
+	  --dist=loadfile --no-loadscope-reorder
 
 check: $(READY) $(LINKS) ## Check formatting, lint and types
 	$(BIN)/ruff format --check .
