@@ -57,6 +57,8 @@ class Passing:
     ----------
     vehicle, number : whose drive, counted from 1.
     distance_m : where the two meet, along the lane.
+    aside_m : of its middle, to the right of that of the lane.
+    moment_a_m2 : 3 V B / mu0 of a permeable sphere is that in 24 m3: a lorry of 6 m.
     """
 
     vehicle: str
@@ -64,7 +66,7 @@ class Passing:
     distance_m: float
     speed_m_s: float = 12.0
     aside_m: float = -3.6
-    moment_a_m2: float = 1500.0
+    moment_a_m2: float = 3000.0
 
 
 @dataclass(frozen=True)
@@ -190,7 +192,7 @@ def passing_field(
     return np.asarray(_NT_M3_PER_A_M2 * field * there[:, None])
 
 
-_OUT_OF_SIGHT_M = 120.0  # 0.1 nT is left there of the truck's field
+_OUT_OF_SIGHT_M = 120.0  # 0.3 nT is left there of the truck's field
 
 
 def _sources(road: Road) -> tuple[Floats, Floats]:

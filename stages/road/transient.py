@@ -5,24 +5,29 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from magtiles.stages.road.statistics import Statistics
+from magtiles.stages.road.statistics import Counts, Statistics
 
 Real = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _SLOW_M = 80.0
 """Over which a difference of calibrations is constant: longer than a transient."""
-_SEED = 6.0
-"""Standard deviations at which a difference is no scatter, and"""
-_EDGE = 2.5
+_LENGTH_M = 4.0
+"""Over which a lorry is felt at the least; steel under the lane, which others missed, is not."""
+_SEED = 2.6
+"""Standard deviations, all along that length, at which a difference is no scatter, and"""
+_EDGE = 1.2
 """those down to which it belongs to the same disturbance."""
-_LEAST_NT = 1000.0
-_APART_M = 1.0
+_APART_M = 0.5
 """Two passes lie this far apart even when aligned, in lane and place: steep fields differ."""
-_NEAR_M = 5.0
-_CALIBRATION = 0.5
+_NEAR_M = 2.0
+_CALIBRATION = 0.2
 """Share of a local feature by which lanes and vehicles may see it differently."""
-_CLEARLY = 3.0
+_FLOOR_NT = 150.0
+"""Scatter that passes have in any case."""
+_PRIOR = 3.0
+"""Degrees of freedom that this expected scatter weighs against that of a point's own passes."""
+_CLEARLY = 2.0
 """Times nearer that one of two passes must be for the other to be dropped."""
 
 
@@ -51,13 +56,15 @@ def drop_transients(
     if not where.any():
         return where, np.zeros_like(where)
     before = statistics.passes
-    expected = _expected(statistics, vehicle)
-    difference = _without_slow(field - expected, where & (before > 0), spacing_m)
-    scale = _scale(expected, difference, where & (before > 0), spacing_m)
+    both = where & (before > 0)
+    expected, number = _expected(statistics, vehicle)
+    difference = _without_slow(field - expected, both, spacing_m)
+    difference /= np.sqrt(1.0 + 1.0 / np.maximum(number, 1))[:, None]
     # What two passes of which one is disturbed say is no measure: the new one is.
-    own_scale = _scale(np.where(where[:, None], field, expected), difference, where, spacing_m)
-    disputed = _disputed(statistics, own_scale, before, spacing_m)
-    lone = _stretches(difference, scale, where & (before > 1) & ~disputed)
+    own = np.where(where[:, None], field, expected)
+    disputed = _disputed(statistics, _variance(own, difference, both, spacing_m), spacing_m)
+    variance = _measured(statistics, _variance(expected, difference, both, spacing_m))
+    lone = _stretches(difference, variance, where & (before > 1) & ~disputed, spacing_m)
     for stretch in _runs(lone):
         lone[stretch] &= not already[stretch].any()
     dropped = lone.copy()
@@ -66,10 +73,13 @@ def drop_transients(
     return where & ~lone, dropped
 
 
-def _expected(statistics: Statistics, vehicle: int) -> Real:
-    """The vehicle's own mean where it was, else that of the others."""
-    own = (statistics.number[vehicle] > 0)[:, None]
-    return np.where(own, statistics.mean[vehicle], statistics.plain_mean)
+def _expected(statistics: Statistics, vehicle: int) -> tuple[Real, Counts]:
+    """The vehicle's own mean where it was twice, else that of all passes, and of how many."""
+    own = statistics.number[vehicle] > 1
+    total = (statistics.number[..., None] * statistics.mean).sum(axis=0)
+    mean = total / np.maximum(statistics.passes, 1)[:, None]
+    number = np.where(own, statistics.number[vehicle], statistics.passes)
+    return np.where(own[:, None], statistics.mean[vehicle], mean), number
 
 
 def _without_slow(values: Real, where: Mask, spacing_m: float) -> Real:
@@ -84,8 +94,8 @@ def _without_slow(values: Real, where: Mask, spacing_m: float) -> Real:
     return out
 
 
-def _scale(expected: Real, difference: Real, where: Mask, spacing_m: float) -> Real:
-    """Standard deviation (point, 3) that an undisturbed difference may have."""
+def _variance(expected: Real, difference: Real, where: Mask, spacing_m: float) -> Real:
+    """Variance (point, 3) of an undisturbed pass, to judge by the field and the whole road."""
     from scipy.ndimage import maximum_filter1d
 
     typical = 1.4826 * np.median(np.abs(difference[where]), axis=0) if where.any() else 0.0
@@ -94,15 +104,23 @@ def _scale(expected: Real, difference: Real, where: Mask, spacing_m: float) -> R
     steep = maximum_filter1d(np.broadcast_to(steep, expected.shape), size, axis=0)
     local = _without_slow(expected, np.ones(len(expected), dtype=np.bool_), spacing_m)
     squares = typical**2 + (_APART_M * steep) ** 2 + (_CALIBRATION * local) ** 2
-    return np.asarray(np.maximum(np.sqrt(squares), _LEAST_NT / _SEED))
+    return np.asarray(np.maximum(squares, _FLOOR_NT**2))
 
 
-def _stretches(difference: Real, scale: Real, where: Mask) -> Mask:
-    """Points of disturbances: runs above the edge, in any axis, that reach the seed."""
-    away = np.max(np.abs(difference) / scale, axis=1)
+def _measured(statistics: Statistics, variance: Real) -> Real:
+    """The expected variance drawn toward that of passes of one vehicle at each point."""
+    freedom = np.maximum(statistics.number - 1, 0).sum(axis=0)[:, None]
+    square = statistics.square_sum.sum(axis=0)
+    return np.asarray((_PRIOR * variance + square) / (_PRIOR + freedom))
+
+
+def _stretches(difference: Real, variance: Real, where: Mask, spacing_m: float) -> Mask:
+    """Points of disturbances: runs above the edge that are above the seed for long enough."""
+    away = np.sqrt(np.mean(difference**2 / variance, axis=1))
+    least = max(int(np.ceil(_LENGTH_M / spacing_m)), 2)
     out = np.zeros_like(where)
     for run in _runs((away > _EDGE) & where):
-        if away[run].max() > _SEED:
+        if any(seed.stop - seed.start >= least for seed in _runs(away[run] > _SEED)):
             out[run] = True
     return out
 
@@ -112,19 +130,17 @@ def _runs(mask: Mask) -> list[slice]:
     return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
-def _disputed(
-    statistics: Statistics, scale: Real, before: NDArray[np.int32], spacing_m: float
-) -> Mask:
+def _disputed(statistics: Statistics, variance: Real, spacing_m: float) -> Mask:
     """Where there are two passes, and they differ by more than scatter."""
-    two = before == 2
-    apart = np.zeros_like(scale)
+    two = statistics.passes == 2
+    apart = np.zeros_like(variance)  # of two passes of one variance, over the root of 2
     one_vehicle = (statistics.number == 2).any(axis=0) & two
-    apart[one_vehicle] = np.sqrt(2.0 * statistics.square_sum.sum(axis=0)[one_vehicle])
+    apart[one_vehicle] = np.sqrt(statistics.square_sum.sum(axis=0)[one_vehicle])
     for first, second in _pairs(statistics, two):
         both = _both(statistics, two, first, second)
         gap = statistics.mean[first] - statistics.mean[second]
-        apart[both] = _without_slow(gap, both, spacing_m)[both]
-    return _stretches(apart, scale, two)
+        apart[both] = _without_slow(gap, both, spacing_m)[both] / np.sqrt(2.0)
+    return _stretches(apart, variance, two, spacing_m)
 
 
 def _pairs(statistics: Statistics, two: Mask) -> list[tuple[int, int]]:
