@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import secrets
 from pathlib import Path
 from typing import Any
 
+import netCDF4
 import numpy as np
 import xarray as xr
 
@@ -20,8 +22,9 @@ _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 def write_artifact(dataset: xr.Dataset, path: Path, contract: str) -> None:
     """Write a dataset, uncompressed, with its contract's full name in attribute `contract`.
 
-    Tiles are packed as a release holds them. The caller has checked the dataset. Raises
-    MagtilesError when it cannot be written.
+    Tiles are packed as a release holds them. The caller has checked a dataset in memory. Of one
+    that is not (`magtiles.stages.rows`), strips are made, written and let go, and the file is
+    checked before it gets its name: ContractError. Raises MagtilesError when it cannot be written.
     """
     try:
         if contract.startswith("anomaly-tile/"):
@@ -36,13 +39,43 @@ def write_artifact(dataset: xr.Dataset, path: Path, contract: str) -> None:
 
 def _write_plain(dataset: xr.Dataset, path: Path, contract: str) -> None:
     plain = dataset.drop_encoding()
+    if plain.chunks:  # what is in another file, then, strip by strip too
+        plain = plain.chunk(plain.chunks, token=secrets.token_hex(8))
     plain.attrs |= {"Conventions": "CF-1.11", "contract": contracts.resolve(contract)}
     encoding: dict[Any, Any] = {}
     for name in plain.variables:
         plain[name].attrs = _flags_like(plain[name])
         encoding[name] = {"_FillValue": None}  # missing is NaN; a fill mark would turn u1 to float
+    late = [name for name, variable in plain.variables.items() if variable.chunks]
     with atomic_path(path) as temporary:
-        plain.to_netcdf(temporary, engine="netcdf4", format="NETCDF4", encoding=encoding)
+        plain.drop_vars(late).to_netcdf(
+            temporary,
+            engine="netcdf4",
+            format="NETCDF4",
+            encoding={name: encoding[name] for name in encoding.keys() - set(late)},
+        )
+        if late:
+            _add_strips(plain[late], temporary)
+            with open_artifact(temporary, cache=False) as written:
+                contracts.check(written, contract, where=path)
+
+
+def _add_strips(dataset: xr.Dataset, path: Path) -> None:
+    """Add variables whose values are not made yet, strip by strip."""
+    import dask.config
+
+    with (
+        netCDF4.Dataset(path, "r+") as opened,
+        dask.config.set(scheduler="synchronous"),  # one strip at a time, and here
+    ):
+        file: Any = opened
+        for name, variable in dataset.data_vars.items():
+            made = file.createVariable(name, variable.dtype, variable.dims, fill_value=False)
+            made.setncatts(variable.attrs)
+            first = 0
+            for rows in (variable.chunks or ((),))[0]:
+                made[first : first + rows] = variable[first : first + rows].values
+                first += rows
 
 
 def open_artifact(path: Path, *, cache: bool = True) -> xr.Dataset:

@@ -86,7 +86,8 @@ def _make(stage: Stage, params: Params, paths: Mapping[str, list[Path]], out: Pa
             for role, files in paths.items()
         }
         result: xr.Dataset = stage.run(**arguments, params=params)
-        contracts.check(result, stage.output, where=f"output of stage {stage.name}")
+        if not result.chunks:  # what is made when it is written is checked then
+            contracts.check(result, stage.output, where=f"output of stage {stage.name}")
         write_artifact(result, out, stage.output)
         return result
 

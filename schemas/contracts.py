@@ -11,6 +11,7 @@ from __future__ import annotations
 import functools
 import json
 import re
+from collections.abc import Iterator
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
@@ -135,29 +136,49 @@ def _describe_variable(variable: xr.Variable) -> dict[str, Any]:
     if "units" in variable.attrs:
         described["units"] = str(variable.attrs["units"])
     if variable.dtype.kind in "fiu":
-        described |= _describe_values(variable.values)
+        described |= _describe_values(variable)
     elif variable.dtype.kind == "M":
         described["finite"] = not bool(np.isnat(variable.values).any())
     return described
 
 
-def _describe_values(values: np.ndarray[Any, Any]) -> dict[str, Any]:
-    if values.size == 0:
-        return {"finite": True, "minimum": None, "maximum": None}
-    low, high = values.min(), values.max()
-    # min and max carry a NaN through, so a clean array needs no further pass.
-    finite = bool(np.isfinite(low) and np.isfinite(high))
-    if not finite:
-        kept = values[np.isfinite(values) | np.isinf(values)]
-        low, high = (kept.min(), kept.max()) if kept.size else (None, None)
+def _describe_values(variable: xr.Variable) -> dict[str, Any]:
+    """What is finite, and the range; strip by strip, for the array may be larger than memory."""
+    finite, lows, highs = True, [], []
+    for values in _strips(variable):
+        if values.size == 0:
+            continue
+        low, high = values.min(), values.max()
+        # min and max carry a NaN through, so a clean array needs no further pass.
+        if not (np.isfinite(low) and np.isfinite(high)):
+            finite = False
+            kept = values[~np.isnan(values)]
+            if kept.size == 0:
+                continue
+            low, high = kept.min(), kept.max()
+        lows.append(float(low))
+        highs.append(float(high))
     described: dict[str, Any] = {
         "finite": finite,
-        "minimum": None if low is None else float(low),
-        "maximum": None if high is None else float(high),
+        "minimum": min(lows, default=None),
+        "maximum": max(highs, default=None),
     }
-    if values.ndim == 1:
-        described["ascending"] = bool(np.all(np.diff(values) > 0))
+    if variable.ndim == 1 and variable.size:
+        described["ascending"] = bool(np.all(np.diff(variable.values) > 0))
     return described
+
+
+_STRIP_NODES = 1 << 20
+
+
+def _strips(variable: xr.Variable) -> Iterator[np.ndarray[Any, Any]]:
+    """The values in strips along the first of several dimensions; of one or none, all at once."""
+    if variable.ndim < 2 or variable.size <= _STRIP_NODES:
+        yield variable.values
+        return
+    rows = max(1, _STRIP_NODES * variable.shape[0] // variable.size)
+    for first in range(0, variable.shape[0], rows):
+        yield variable[first : first + rows].values
 
 
 def _plain(value: Any) -> Any:

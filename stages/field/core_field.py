@@ -6,6 +6,7 @@ The total-field anomaly is what a magnetometer measures less the core field's ma
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from magtiles.stages.declare import OPTIONAL_FILE, IsoDate, Params, Stage, quant
 from magtiles.stages.field.geometry import axes, variable
 from magtiles.stages.ingest.field_model import named_model
 from magtiles.stages.ingest.source import TOTAL_FIELD_ANOMALY
+from magtiles.stages.rows import by_rows, rows_of
 
 Real = NDArray[np.float64]
 
@@ -28,6 +30,12 @@ NO_REFERENCE = "none"
 """`reference_field` of a grid from which no core field was removed: the total field itself."""
 
 _LESS_DIURNAL = ", less the diurnal variation"
+
+_ROWS_LOOKED_AT = 512
+"""Of a grid, to tell a total field from an anomaly."""
+
+_NODES_AT_ONCE = 1 << 18
+"""Of a grid: each takes some 170 bytes while its core field is evaluated."""
 
 _WEAKEST_NT = 10_000.0
 """Below the weakest core field anywhere up to 1000 km, some 15,000 nT."""
@@ -143,19 +151,32 @@ def remove_from_grid(
     used = named_model(params.reference_field, model, role="model")
     core = Core(used, epoch, params.allow_extrapolated)
     total = grid["magnetic_anomaly"]
-    _check_total(total)
-    anomaly = total.values.astype(np.float64) - core.total(*grid_places(grid))
-    return with_anomaly(grid, anomaly).assign_attrs(
+    _check_total(total[:: max(1, len(total) // _ROWS_LOOKED_AT)])
+
+    def anomaly(part: xr.Dataset) -> Real:
+        return part["magnetic_anomaly"].values.astype(np.float64) - core.total(*grid_places(part))
+
+    return with_anomaly(grid, each_node(grid, anomaly)).assign_attrs(
         reference_field=used.name,
         reference_epoch=epoch,
         anomaly_definition=TOTAL_FIELD_ANOMALY + core.note,
     )
 
 
-def with_anomaly(grid: xr.Dataset, anomaly: Real) -> xr.Dataset:
+def with_anomaly(grid: xr.Dataset, anomaly: Any) -> xr.Dataset:
     """The grid with other anomaly values (nT), in double precision."""
     return grid.assign(
         magnetic_anomaly=variable(grid, anomaly, "nT", "total-field magnetic anomaly")
+    )
+
+
+def each_node(grid: xr.Dataset, make: Callable[[xr.Dataset], Real]) -> Any:
+    """Values (rows, columns) at the nodes of a grid, as `make` makes them for any of its rows."""
+    return by_rows(
+        grid["magnetic_anomaly"].shape,
+        np.float64,
+        lambda first, last: make(rows_of(grid, first, last)),
+        _NODES_AT_ONCE,
     )
 
 

@@ -10,6 +10,7 @@ from magtiles.schemas.errors import CoverageError, ParameterError
 from magtiles.stages.declare import Params, Stage, quantity
 from magtiles.stages.field.geometry import axes, is_geographic, is_whole_circle, true_spacing
 from magtiles.stages.field.plane import Plane, choose_plane, grid_index
+from magtiles.stages.rows import by_rows, rows_of, strips
 
 Real = NDArray[np.float64]
 
@@ -59,7 +60,10 @@ def crop_grid(grid: xr.Dataset, *, params: CropGridParams) -> xr.Dataset:
             remedy="choose a region that overlaps the survey",
         )
     first_dim, second_dim = grid["magnetic_anomaly"].dims
-    return grid.isel({first_dim: span[0], second_dim: span[1]})
+    cut = grid.isel({first_dim: span[0], second_dim: span[1]})
+    anomaly = cut["magnetic_anomaly"]
+    values = by_rows(anomaly.shape, anomaly.dtype, lambda a, b: anomaly[a:b].values)
+    return cut.assign(magnetic_anomaly=anomaly.copy(data=values))
 
 
 def _cut_opposite(grid: xr.Dataset, longitude: float) -> xr.Dataset:
@@ -92,11 +96,17 @@ def _region_points(params: CropGridParams, filled: bool) -> tuple[Real, Real]:
 
 def _has_data(grid: xr.Dataset, plane: Plane, params: CropGridParams) -> bool:
     """Whether a value was measured at any of a net of points over the region."""
-    values = grid["magnetic_anomaly"].values
+    shape = grid["magnetic_anomaly"].shape
     row, column = grid_index(grid, plane, *_region_points(params, filled=True))
     r, c = np.rint(row).astype(int), np.rint(column).astype(int)
-    within = (r >= 0) & (r < values.shape[0]) & (c >= 0) & (c < values.shape[1])
-    return bool(np.isfinite(values[r[within], c[within]]).any())
+    within = (c >= 0) & (c < shape[1])
+    for first, last in strips(shape):
+        here = within & (r >= first) & (r < last)
+        if here.any():
+            values = rows_of(grid, first, last)["magnetic_anomaly"].values
+            if np.isfinite(values[r[here] - first, c[here]]).any():
+                return True
+    return False
 
 
 def _extent(grid: xr.Dataset, plane: Plane) -> str:

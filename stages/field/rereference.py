@@ -7,10 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from magtiles.schemas.errors import ContractError
 from magtiles.stages.declare import OPTIONAL_FILE, IsoDate, Params, Stage, quantity
-from magtiles.stages.field.core_field import NO_REFERENCE, Core, grid_places, with_anomaly
+from magtiles.stages.field.core_field import (
+    NO_REFERENCE,
+    Core,
+    each_node,
+    grid_places,
+    with_anomaly,
+)
 from magtiles.stages.ingest.field_model import named_model
 
 MIXED = "mixed"
@@ -57,12 +64,15 @@ def re_reference(
         epoch,
         params.allow_extrapolated,
     )
-    places = grid_places(grid)
-    difference = old.total(*places) - new.total(*places)
-    anomaly = grid["magnetic_anomaly"].values.astype(np.float64) + difference
+
+    def anomaly(part: xr.Dataset) -> NDArray[np.float64]:
+        places = grid_places(part)
+        difference = old.total(*places) - new.total(*places)
+        return part["magnetic_anomaly"].values.astype(np.float64) + difference
+
     definition = _renamed(str(grid.attrs["anomaly_definition"]), old_name, new.model.name)
     definition = definition.replace(old_epoch, epoch)
-    return with_anomaly(grid, anomaly).assign_attrs(
+    return with_anomaly(grid, each_node(grid, anomaly)).assign_attrs(
         reference_field=new.model.name,
         reference_epoch=epoch,
         anomaly_definition=definition + new.note,

@@ -15,7 +15,7 @@ from pyproj.exceptions import CRSError
 from magtiles.schemas.errors import FormatError, SourceError
 from magtiles.stages.ingest.foreign import read_foreign
 from magtiles.stages.ingest.gmt_netcdf import is_old_gmt, read_old_gmt
-from magtiles.stages.ingest.raw import METRES, RawGrid
+from magtiles.stages.ingest.raw import METRES, Converted, RawGrid
 from magtiles.stages.ingest.source import GridFileParams
 
 _NORTH = ("degrees_north", "degree_north", "degrees_n", "degree_n")
@@ -67,10 +67,9 @@ def _read(dataset: xr.Dataset, path: Path, params: GridFileParams) -> RawGrid:
     says = _stated(dataset, variable, x_dim)
     x, x_ulp = _nodes(dataset, x_dim, crs, where)
     y, y_ulp = _nodes(dataset, y_dim, crs, where)
+    mark = None if "no_data" in says else params.no_data
     return RawGrid(
-        values=_unpacked(
-            flat.transpose(y_dim, x_dim), None if "no_data" in says else params.no_data
-        ),
+        values=Converted(flat.transpose(y_dim, x_dim), lambda part: _unpacked(part, mark)),
         x=x,
         y=y,
         x_ulp=x_ulp,
@@ -205,13 +204,13 @@ def _stated(dataset: xr.Dataset, variable: xr.DataArray, x_dim: str) -> dict[str
     return says
 
 
-def _uncertainty(
-    dataset: xr.Dataset, name: str, dims: tuple[str, str]
-) -> NDArray[np.float64] | None:
+def _uncertainty(dataset: xr.Dataset, name: str, dims: tuple[str, str]) -> Converted | float | None:
     if name not in dataset.variables:
         return None
     found = dataset[name]
-    return _unpacked(found if found.ndim == 0 else found.squeeze().transpose(*dims), None)
+    if found.ndim == 0:
+        return float(_unpacked(found, None))
+    return Converted(found.squeeze().transpose(*dims), lambda part: _unpacked(part, None))
 
 
 def _unpacked(variable: xr.DataArray, extra_mark: float | None) -> NDArray[np.float64]:

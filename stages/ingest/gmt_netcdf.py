@@ -13,7 +13,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from magtiles.schemas.errors import FormatError
-from magtiles.stages.ingest.raw import RawGrid, mark_voids
+from magtiles.stages.ingest.raw import Converted, RawGrid, mark_voids
 from magtiles.stages.ingest.source import GridFileParams
 
 _VARIABLES = {"x_range", "y_range", "spacing", "dimension", "z"}
@@ -39,13 +39,16 @@ def read_old_gmt(dataset: xr.Dataset, path: Path, params: GridFileParams) -> Raw
             remedy="fetch it again",
         )
     # GMT's own mark is NaN; grids resampled from others may still hold theirs.
-    mark = float(stored.attrs.get("_FillValue", np.nan))
-    values = mark_voids(stored.values, params.no_data if np.isnan(mark) else mark)
-    values = values * float(stored.attrs.get("scale_factor", 1.0))
-    values = values + float(stored.attrs.get("add_offset", 0.0))
+    own = float(stored.attrs.get("_FillValue", np.nan))
+    mark = params.no_data if np.isnan(own) else own
+    scale = float(stored.attrs.get("scale_factor", 1.0))
+    offset = float(stored.attrs.get("add_offset", 0.0))
     cells = int(stored.attrs.get("node_offset", 0)) == 1
     return RawGrid(
-        values=values.reshape(rows, columns),
+        values=Converted(
+            stored.values.reshape(rows, columns),
+            lambda part: mark_voids(part, mark) * scale + offset,
+        ),
         x=_nodes(dataset["x_range"].values, columns, cells),
         y=_nodes(dataset["y_range"].values, rows, cells)[::-1],
         crs=None,

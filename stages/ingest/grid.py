@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from magtiles.stages.ingest.gridded import (
     settle,
 )
 from magtiles.stages.ingest.source import ANOMALY_GRID, TOTAL_FIELD_ANOMALY, IngestGridParams
+from magtiles.stages.rows import Rows, by_rows, strips
 
 _LOG = logging.getLogger(__name__)
 
@@ -66,7 +68,7 @@ STAGE = Stage(
 )
 
 
-def _sigma(grid: RegularGrid, file: GridFile[IngestGridParams]) -> NDArray[np.float64]:
+def _sigma(grid: RegularGrid, file: GridFile[IngestGridParams]) -> Any:
     """1 sigma in nT: the file's own, and where it states none the key `uncertainty_nt`.
 
     A value that is not above zero, such as EMAG2's -888, is none; at voids it becomes NaN.
@@ -74,33 +76,64 @@ def _sigma(grid: RegularGrid, file: GridFile[IngestGridParams]) -> NDArray[np.fl
     own, given = grid.uncertainty, file.params.uncertainty_nt
     if own is None:
         return np.asarray(given, dtype=np.float64)
-    lacks = ~(own > 0.0) & ~np.isnan(grid.values)
-    if given is not None and not lacks.any():
+    sigma = _StatedSigma(own, grid.values, given)
+    lacking, marks, mark = sigma.lacking()
+    if given is not None and not lacking:
         raise SourceError(
             f"key 'uncertainty_nt' is {given}, but the file {file.path.name} has its own "
             "uncertainty everywhere",
             where=file.where,
             remedy="remove the key",
         )
-    marks = np.broadcast_to(own, lacks.shape)[lacks & ~np.isnan(own)]
-    if given is None and marks.size:
+    if given is None and marks:
         raise FormatError(
-            f"{marks.size} values of its uncertainty are {marks[0]:g} or otherwise not above zero",
+            f"{marks} values of its uncertainty are {mark:g} or otherwise not above zero",
             where=file.path,
             remedy="set uncertainty_nt, which is then taken where the file states none",
         )
-    stated = np.where(own > 0.0, own, np.nan)
-    return stated if given is None else np.where(lacks, given, stated)
+    if given is None and isinstance(own, float):
+        return np.where(own > 0.0, own, np.nan)
+    return by_rows(grid.values.shape, np.float64, sigma.rows)
 
 
-def _dataset(
-    grid: RegularGrid, sigma: NDArray[np.float64], file: GridFile[IngestGridParams]
-) -> xr.Dataset:
+@dataclass(frozen=True)
+class _StatedSigma:
+    """Sigma that a file states, beside its values, and what stands in for it."""
+
+    own: Rows | float
+    values: Rows
+    given: float | None
+
+    def rows(self, first: int, last: int) -> NDArray[np.float64]:
+        """Rows of it."""
+        own, lacks = self._read(first, last)
+        stated = np.where(own > 0.0, own, np.nan)
+        return stated if self.given is None else np.where(lacks, self.given, stated)
+
+    def lacking(self) -> tuple[bool, int, float]:
+        """Whether any value has none; how many marks stand in its place, and the first."""
+        some, marks, mark = False, 0, 0.0
+        for first, last in strips(self.values.shape):
+            own, lacks = self._read(first, last)
+            found = own[lacks & ~np.isnan(own)]
+            mark = float(found[0]) if found.size and not marks else mark
+            some, marks = some or bool(lacks.any()), marks + found.size
+        return some, marks, mark
+
+    def _read(self, first: int, last: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        values = self.values[first:last]
+        own = self.own if isinstance(self.own, float) else self.own[first:last]
+        full = np.broadcast_to(np.asarray(own), values.shape)
+        return full, ~(full > 0.0) & ~np.isnan(values)
+
+
+def _dataset(grid: RegularGrid, sigma: Any, file: GridFile[IngestGridParams]) -> xr.Dataset:
     params = file.params
+    values = by_rows(grid.values.shape, np.float64, lambda a, b: grid.values[a:b])
     variables: dict[str, Any] = {
         "magnetic_anomaly": (
             grid.dims,
-            grid.values,
+            values,
             {"units": "nT", "long_name": "magnetic anomaly", "grid_mapping": "crs"},
         ),
         "magnetic_anomaly_uncertainty": (

@@ -31,6 +31,7 @@ from magtiles.stages.ingest.raw import RawGrid, refuse_infinite
 from magtiles.stages.ingest.source import GridFileParams, SourceKind, locate_all, merge
 from magtiles.stages.ingest.unpack import unpacked
 from magtiles.stages.ingest.xyz import read_xyz
+from magtiles.stages.rows import Rows, in_strips
 
 G = TypeVar("G", bound=GridFileParams)
 
@@ -78,12 +79,12 @@ class GridFile(Generic[G]):
 class RegularGrid:
     """A grid in the conventions of the house: ascending, metres or degrees.
 
-    `values` (rows, columns) and `uncertainty` (the same, or (); None where there is none) in
-    the unit of what is measured; `x`, `y` in the units of `crs`.
+    `values` (rows, columns) and `uncertainty` (the same, or a number; None where there is none)
+    in the unit of what is measured; `x`, `y` in the units of `crs`.
     """
 
-    values: NDArray[np.float64]
-    uncertainty: NDArray[np.float64] | None
+    values: Rows
+    uncertainty: Rows | float | None
     x: NDArray[np.float64]
     y: NDArray[np.float64]
     crs: pyproj.CRS
@@ -150,7 +151,8 @@ def _header_of(files: Sequence[Path]) -> Path:
 def _read(path: Path, params: GridFileParams) -> RawGrid:
     with unpacked(path, params.member) as file:
         try:
-            return _READERS[sniff(file)](file, params)
+            grid = _READERS[sniff(file)](file, params)
+            return grid if file == path else grid.in_memory()
         except (FormatError, SourceError) as caught:
             if file == path:
                 raise
@@ -230,13 +232,33 @@ def regular(grid: GridFile[G]) -> RegularGrid:
         _check_latitudes(y, file)
     measures = grid.params.measures
     factor = measures.per(grid.params.units or measures.unit, where=f"{grid.where} units")
-    pick = np.ix_(rows, columns)
-    uncertainty = raw.uncertainty
-    if uncertainty is not None:
-        uncertainty = (uncertainty if uncertainty.ndim == 0 else uncertainty[pick]) * factor
-    values = raw.values[pick] * factor
+    values, uncertainty = _Ordered(raw.values, rows, columns, factor), raw.uncertainty
+    if isinstance(uncertainty, float):
+        uncertainty *= factor
+    elif uncertainty is not None:
+        uncertainty = _Ordered(uncertainty, rows, columns, factor)
     _check_values(values, grid)
     return RegularGrid(values, uncertainty, np.ascontiguousarray(x), np.ascontiguousarray(y), crs)
+
+
+@dataclass(frozen=True)
+class _Ordered:
+    """The values of a raw grid in other rows and columns, and in another unit."""
+
+    raw: Rows
+    rows: NDArray[np.intp]
+    columns: NDArray[np.intp]
+    factor: float
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.rows.size, self.columns.size
+
+    def __getitem__(self, rows: slice, /) -> NDArray[np.float64]:
+        wanted = self.rows[rows]
+        first = int(wanted.min())
+        part = self.raw[first : int(wanted.max()) + 1]
+        return part[np.ix_(wanted - first, self.columns)] * self.factor
 
 
 def _settled_crs(grid: GridFile[G]) -> pyproj.CRS:
@@ -287,32 +309,40 @@ def _check_marks(grid: GridFile[G]) -> None:
     """Refuse what others mark voids with, where nobody says whether it does here."""
     if grid.params.no_data is not None:
         return
-    marks = np.isin(np.abs(grid.raw.values), _OTHERS_VOIDS)
-    if marks.any():
-        mark = grid.raw.values[marks][0]
+    count, mark = 0, 0.0
+    for _, part in in_strips(grid.raw.values):
+        marks = part[np.isin(np.abs(part), _OTHERS_VOIDS)]
+        if marks.size:
+            count, mark = count + marks.size, mark or float(marks[0])
+    if count:
         raise FormatError(
-            f"{np.count_nonzero(marks)} values are {mark:g}, as in other files where there is "
-            "no value",
+            f"{count} values are {mark:g}, as in other files where there is no value",
             where=grid.path.name,
             expected="voids marked by the file, or by the key 'no_data'",
             remedy=f"set no_data = {mark:g}.0, or, if they are values, to a number that none is",
         )
 
 
-def _check_values(values: NDArray[np.float64], grid: GridFile[G]) -> None:
-    if np.isnan(values).all():
+def _check_values(values: Rows, grid: GridFile[G]) -> None:
+    measures, void = grid.params.measures, True
+    worst, place = 0.0, (0, 0)
+    for first, part in in_strips(values):
+        if np.isnan(part).all():
+            continue
+        void = False
+        row, column = np.unravel_index(int(np.nanargmax(np.abs(part))), part.shape)
+        if abs(part[row, column]) > abs(worst):
+            worst, place = float(part[row, column]), (first + int(row), int(column))
+    if void:
         raise FormatError(
             "every value is void",
             where=grid.path.name,
             remedy="check the key 'no_data' and the file's own void mark",
         )
-    measures = grid.params.measures
-    worst = int(np.nanargmax(np.abs(values)))
-    if abs(values.flat[worst]) > measures.largest:
-        row, column = np.unravel_index(worst, values.shape)
+    if abs(worst) > measures.largest:
         raise FormatError(
-            f"the value at row {row}, column {column} (from the south-west) is "
-            f"{values.flat[worst]:g} {measures.unit}",
+            f"the value at row {place[0]}, column {place[1]} (from the south-west) is "
+            f"{worst:g} {measures.unit}",
             where=grid.path.name,
             expected=f"at most {measures.largest:g} in magnitude",
             remedy="if it marks a void, state it with the key 'no_data'; else check 'units'",

@@ -21,6 +21,7 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.io import MemoryFile
+from rasterio.windows import Window
 
 from magtiles.schemas.errors import FormatError, SourceError
 from magtiles.stages.ingest.files import check_tiff_directories
@@ -95,22 +96,24 @@ def _ers_number(header: str, key: str, path: Path, default: int | None = None) -
 class _Format:
     """GDAL's driver, the name people know, and what to check before GDAL reads.
 
-    `from_memory`: the driver looks for sidecars whatever it is told.
+    `from_memory`: the driver looks for sidecars whatever it is told. `text` is read from its
+    start, whichever rows are wanted.
     """
 
     driver: str
     name: str
     check: Callable[[Path], None] | None = None
     from_memory: bool = False
+    text: bool = False
 
 
 _FORMATS = {
     "geotiff": _Format("GTiff", "GeoTIFF", check_tiff_directories),
-    "surfer-6-text": _Format("GSAG", "Surfer 6 text grid"),
+    "surfer-6-text": _Format("GSAG", "Surfer 6 text grid", text=True),
     "surfer-6": _Format("GSBG", "Surfer 6 grid"),
     "surfer-7": _Format("GS7BG", "Surfer 7 grid", _check_surfer_7),
     "er-mapper": _Format("ERS", "ER Mapper grid", _check_ers_data),
-    "esri-ascii": _Format("AAIGrid", "ESRI ASCII grid", from_memory=True),
+    "esri-ascii": _Format("AAIGrid", "ESRI ASCII grid", from_memory=True, text=True),
 }
 KINDS = tuple(_FORMATS)
 """What `files.sniff` calls the formats read here."""
@@ -126,11 +129,21 @@ def read_raster(kind: str, path: Path, params: GridFileParams) -> RawGrid:
     form = _FORMATS[kind]
     if form.check is not None:
         form.check(path)
+    with _opened(path, form) as dataset:
+        grid = _read(dataset, path, form, params)
+    return grid.in_memory() if form.text else grid
+
+
+@contextlib.contextmanager
+def _opened(path: Path, form: _Format) -> Iterator[Any]:
     try:
-        with warnings.catch_warnings(), rasterio.Env(**_ALONE):
+        with warnings.catch_warnings(), rasterio.Env(**_ALONE), contextlib.ExitStack() as opened:
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with _opened(path, form) as dataset:
-                return _read(dataset, path, params)
+            if form.from_memory:
+                file = opened.enter_context(MemoryFile(path.read_bytes()))
+                yield opened.enter_context(file.open(driver=form.driver))
+            else:
+                yield opened.enter_context(rasterio.open(path, driver=form.driver))
     except RasterioError as caught:
         raise FormatError(
             f"is not a whole {form.name}: {_detail(caught, path)}",
@@ -147,32 +160,43 @@ def _detail(caught: RasterioError, path: Path) -> str:
     )
 
 
-@contextlib.contextmanager
-def _opened(path: Path, form: _Format) -> Iterator[Any]:
-    if not form.from_memory:
-        with rasterio.open(path, driver=form.driver) as dataset:
-            yield dataset
-        return
-    with MemoryFile(path.read_bytes()) as memory, memory.open(driver=form.driver) as dataset:
-        yield dataset
+@dataclass(frozen=True)
+class _Band:
+    """The values of a band, float64 with voids NaN, of which rows are read when wanted."""
+
+    path: Path
+    form: _Format
+    band: int
+    shape: tuple[int, int]
+    mark: float | None
+
+    def __getitem__(self, rows: slice, /) -> NDArray[np.float64]:
+        first, last, _ = rows.indices(self.shape[0])
+        window = Window(0, first, self.shape[1], last - first)
+        with _opened(self.path, self.form) as dataset:
+            stored = dataset.read(self.band, masked=True, window=window)
+            scale, offset = dataset.scales[self.band - 1], dataset.offsets[self.band - 1]
+        values: NDArray[np.float64] = stored.data.astype(np.float64) * scale + offset
+        values[np.ma.getmaskarray(stored)] = np.nan
+        if self.mark is not None:
+            values[stored.data == stored.dtype.type(self.mark)] = np.nan
+        return values
 
 
-def _read(dataset: Any, path: Path, params: GridFileParams) -> RawGrid:
+def _read(dataset: Any, path: Path, form: _Format, params: GridFileParams) -> RawGrid:
     band = _choose_band(dataset, path, params.band)
     x, y = _nodes(dataset, path)
-    stored = dataset.read(band, masked=True)
-    values = _scaled(stored, dataset.scales[band - 1], dataset.offsets[band - 1])
     says: dict[str, Any] = {}
     if dataset.driver == "GTiff":
         point = dataset.tags().get("AREA_OR_POINT") == "Point"
         says["registration"] = "point" if point else "pixel"
     if dataset.units[band - 1]:
         says["units"] = dataset.units[band - 1]
+    mark = params.no_data
     if dataset.nodatavals[band - 1] is not None and np.isfinite(dataset.nodatavals[band - 1]):
-        says["no_data"] = float(dataset.nodatavals[band - 1])
-    elif params.no_data is not None:
-        values[stored.data == stored.dtype.type(params.no_data)] = np.nan
+        says["no_data"], mark = float(dataset.nodatavals[band - 1]), None
     crs = pyproj.CRS.from_user_input(dataset.crs) if dataset.crs else None
+    values = _Band(path, form, band, (dataset.height, dataset.width), mark)
     return RawGrid(values=values, x=x, y=y, crs=crs, says=says)
 
 
@@ -204,9 +228,3 @@ def _nodes(dataset: Any, path: Path) -> tuple[NDArray[np.float64], NDArray[np.fl
     x = transform.c + transform.a * (np.arange(dataset.width) + 0.5)
     y = transform.f + transform.e * (np.arange(dataset.height) + 0.5)
     return x, y
-
-
-def _scaled(stored: Any, scale: float, offset: float) -> NDArray[np.float64]:
-    values: NDArray[np.float64] = stored.data.astype(np.float64) * scale + offset
-    values[np.ma.getmaskarray(stored)] = np.nan
-    return values

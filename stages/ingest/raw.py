@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ import pyproj
 from numpy.typing import NDArray
 
 from magtiles.schemas.errors import FormatError, SourceError
+from magtiles.stages.rows import Rows, in_strips
 
 
 @dataclass(frozen=True)
@@ -19,22 +20,46 @@ class RawGrid:
 
     Attributes
     ----------
-    values : (rows, columns) in the file's unit; NaN where the file marks a void.
+    values : (rows, columns) in the file's unit; NaN where the file marks a void. An array, or
+        rows that are read when they are wanted.
     x, y : coordinates of the nodes (cell centres), in units of the CRS, in the file's order.
     x_ulp, y_ulp : rounding of the stored coordinates, that regularity is judged by.
     crs : None where the file does not say.
     says : the [grid] keys the file itself states.
-    uncertainty : (rows, columns) or (), in the file's unit, where the file has one.
+    uncertainty : (rows, columns), or one number, in the file's unit, where the file has it.
     """
 
-    values: NDArray[np.float64]
+    values: Rows
     x: NDArray[np.float64]
     y: NDArray[np.float64]
     crs: pyproj.CRS | None
     x_ulp: float = 0.0
     y_ulp: float = 0.0
     says: Mapping[str, Any] = field(default_factory=dict)
-    uncertainty: NDArray[np.float64] | None = None
+    uncertainty: Rows | float | None = None
+
+    def in_memory(self) -> RawGrid:
+        """The same, read whole: for a file that will not be there for long."""
+        sigma = self.uncertainty
+        if sigma is not None and not isinstance(sigma, float):
+            sigma = sigma[:]
+        return replace(self, values=self.values[:], uncertainty=sigma)
+
+
+@dataclass(frozen=True)
+class Converted:
+    """Values as they are stored, converted when rows of them are wanted."""
+
+    stored: Any
+    convert: Callable[[Any], NDArray[np.float64]]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Rows and columns."""
+        return tuple(self.stored.shape)
+
+    def __getitem__(self, rows: slice, /) -> NDArray[np.float64]:
+        return self.convert(self.stored[rows])
 
 
 @dataclass(frozen=True)
@@ -115,13 +140,14 @@ def mark_voids(values: NDArray[Any], mark: float | None) -> NDArray[np.float64]:
     return out
 
 
-def refuse_infinite(values: NDArray[np.float64], *, where: object) -> None:
+def refuse_infinite(values: Rows, *, where: object) -> None:
     """Raise FormatError naming the first infinite value."""
-    infinite = np.isinf(values)
-    if infinite.any():
-        row, column = np.unravel_index(int(np.argmax(infinite)), values.shape)
-        raise FormatError(
-            f"the value at row {row}, column {column} is infinite",
-            where=where,
-            expected="finite values or the file's void mark",
-        )
+    for first, part in in_strips(values):
+        infinite = np.isinf(part)
+        if infinite.any():
+            row, column = np.unravel_index(int(np.argmax(infinite)), part.shape)
+            raise FormatError(
+                f"the value at row {first + row}, column {column} is infinite",
+                where=where,
+                expected="finite values or the file's void mark",
+            )

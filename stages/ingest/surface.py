@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import xarray as xr
 
 from magtiles.schemas.errors import SourceError
 from magtiles.stages.declare import FILES, Stage
 from magtiles.stages.ingest.gridded import datum_attributes, read_grid, regular, settle
 from magtiles.stages.ingest.source import SURFACE_GRID, IngestSurfaceParams
+from magtiles.stages.rows import by_rows
 
 _NAMES = {"terrain": "height of the terrain", "mean_sea_level": "geoid height"}
 
@@ -30,6 +32,7 @@ def ingest_surface(files: Sequence[Path], *, params: IngestSurfaceParams) -> xr.
     check_surface_keys(params, file.where)
     grid = regular(file)
     raised = params.undulation_m or 0.0
+    heights = by_rows(grid.values.shape, np.float64, lambda a, b: grid.values[a:b] + raised)
     reference = "ellipsoid" if params.undulation_m is not None else params.height_reference
     attributes = {
         "units": "m",
@@ -39,7 +42,7 @@ def ingest_surface(files: Sequence[Path], *, params: IngestSurfaceParams) -> xr.
     }
     facts = {"surface": params.surface, "height_reference": reference, "source": file.name}
     return grid.dataset(
-        {"surface_height": (grid.dims, grid.values + raised, attributes)},
+        {"surface_height": (grid.dims, heights, attributes)},
         facts | datum_attributes(grid, file),
     )
 
