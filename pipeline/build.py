@@ -15,6 +15,7 @@ from magtiles.pipeline.model_map import plan_model_map
 from magtiles.pipeline.product import ModelMap, Product, SurveyMap, load_product
 from magtiles.pipeline.progress import Progress, silent
 from magtiles.pipeline.roads_part import build_roads
+from magtiles.pipeline.source_paths import check_there
 from magtiles.pipeline.steps import MapPlan, PartResult, Steps
 from magtiles.pipeline.survey_map import plan_survey_map
 from magtiles.pipeline.tasks import SCRATCH, Workplace, working
@@ -56,6 +57,7 @@ def build_product(
     folder = work / wanted.product.name
     for written in (store / wanted.product.name, folder):
         _check_writable(written)
+    _check_inputs(wanted, store, data)
     with _asked_by(product), _alone_in(folder):
         return _build(wanted, store, folder, data, progress, scheduler)
 
@@ -100,6 +102,19 @@ def _asked_by(product: Path) -> Iterator[None]:
         raise type(error)(
             error.what, where=where, expected=error.expected, remedy=error.remedy
         ) from error
+
+
+def _check_inputs(wanted: Product, store: Path, data: Path | None) -> None:
+    """Raise SourceError, before the work, for data files that are not there."""
+    try:
+        for source in wanted.sources:
+            check_there(source, data)
+    except SourceError as error:
+        release = store / wanted.product.name / wanted.product.version
+        if not release.is_dir():
+            raise
+        what = f"{error.what}; {release}, built from it, stays as it is and may be stale"
+        raise SourceError(what, where=error.where, remedy=error.remedy) from error
 
 
 def _build(

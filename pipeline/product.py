@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import pydantic
 
@@ -216,6 +217,18 @@ class Product:
     map: SurveyMap | ModelMap
     temporal: TemporalSources | None = None
     roads: tuple[RoadSources, ...] = ()
+
+    @property
+    def sources(self) -> Iterator[Source[Any]]:
+        """Every source TOML it is made from; coefficient files are not among them."""
+        if isinstance(self.map, SurveyMap):
+            yield self.map.source
+            if self.map.surface is not None:
+                yield from (source for _, source in self.map.surface.sources)
+        if self.temporal is not None:
+            yield from (*self.temporal.observatories, *self.temporal.indices)
+        for roads in self.roads:
+            yield from roads.sources
 
 
 def load_product(path: Path) -> Product:

@@ -51,6 +51,23 @@ def data_files(source: Source[Any], data: Path | None) -> list[Path]:
     return list(source.files) if data is None else [data / file.name for file in source.files]
 
 
+def check_there(source: Source[Any], data: Path | None) -> None:
+    """Raise SourceError for a source whose data files are not all there."""
+    files = data_files(source, data)
+    missing = [file for file in files if not file.is_file()]
+    if not missing:
+        return
+    fetched = source.path.parent == _CATALOG and data is None
+    raise SourceError(
+        f"{len(missing)} of the {len(files)} data files of '{source.source.id}' "
+        f"{'is' if len(missing) == 1 else 'are'} missing: no file {missing[0]}",
+        where=source.path,
+        remedy=f"run magtiles fetch {source.source.id}"
+        if fetched
+        else "put it there, or name the folder where it is with --from",
+    )
+
+
 def manifest_inputs(source: Source[Any], files: Sequence[Path], role: str) -> list[dict[str, str]]:
     """What a manifest says of a source: each of its data files, with digest and licence."""
     header = source.source

@@ -263,8 +263,13 @@ _FILES = [
     Expect(uneven, 1, ["uneven.nc axis x", "index 19 to 20", "1300"], "irregular"),
     Expect(raster(-999999.0), 1, ["small-survey.tif", "every value is void"], "all-void"),
     Expect(raster(np.inf), 1, ["small-survey.tif", "row 0, column 0 is infinite"], "infinite"),
-    Expect(without("survey"), 1, ["small-survey.tif", "no such file"], "no-data-file"),
-    Expect(elsewhere, 1, ["elsewhere/small-survey.tif", "no such file"], "no-data-file-from"),
+    Expect(
+        without("survey"),
+        1,
+        ["small-survey.toml: 1 of the 1 data files of", "no file", "small-survey.tif", "--from"],
+        "no-data-file",
+    ),
+    Expect(elsewhere, 1, ["no file", "elsewhere/small-survey.tif"], "no-data-file-from"),
     Expect(cut_artifact, 1, ["half.nc", "truncated or damaged"], "truncated-artifact"),
     Expect(
         artifact_of_another_contract,

@@ -1,6 +1,6 @@
 """Builds that are killed, or run out of room, at random moments, and what they leave behind.
 
-``python tests/truth/killed_builds.py 50`` disturbs 50 builds of a small map made in blocks by a
+``python tests/truth/killed_builds.py 50`` disturbs 50 builds of a small map, some of them with a
 local cluster. After each it looks at the store, waits for orphans, builds once more, and compares
 what is then there with what an undisturbed build leaves. ``--how`` names the disturbances.
 """
@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import hashlib
+import importlib
 import os
 import random
 import resource
@@ -34,13 +36,16 @@ KILLED = -signal.SIGKILL
 
 _PATIENCE_S = 60.0
 """How long orphans may take to notice, on a machine that does much else."""
+_IMPORTED = ("magtiles.pipeline.build", "matplotlib.backends.backend_agg", "distributed")
+"""Once by the program, rather than by each of its builds."""
 _FREE = resource.RLIM_INFINITY
 
 
-def write_product(folder: Path) -> Path:
-    """A product of two levels, each of several blocks, and of several tiles."""
+def write_product(folder: Path, *, in_blocks: bool) -> Path:
+    """A product of two levels and several tiles; in blocks, which asks for a cluster, or whole."""
     product = write_survey(folder, synthesize(SPEC))[-1]
-    product.write_text(product.read_text() + "block_nodes = 128\ntile_deg = 0.25\n")
+    blocks = "block_nodes = 128\n" if in_blocks else ""
+    product.write_text(f"{product.read_text()}tile_deg = 0.25\n{blocks}")
     return product
 
 
@@ -48,8 +53,18 @@ def write_product(folder: Path) -> Path:
 class Place:
     """Where builds of a product happen, and nothing else does: the user's folder and /tmp too."""
 
-    folder: Path
-    product: Path
+    within: Path
+    in_cluster: bool
+
+    @functools.cached_property
+    def product(self) -> Path:
+        """The product."""
+        return write_product(self.within / "in", in_blocks=self.in_cluster)
+
+    @property
+    def folder(self) -> Path:
+        """Where everything is that builds write."""
+        return self.within / "out"
 
     @property
     def store(self) -> Path:
@@ -59,7 +74,7 @@ class Place:
     @property
     def said(self) -> str:
         """What the last build printed."""
-        return (self.folder.parent / "log").read_text()
+        return (self.within / "log").read_text()
 
     def files(self) -> set[str]:
         """Everything that is there."""
@@ -73,16 +88,16 @@ class Place:
             if path.is_file() and not path.relative_to(self.store).parts[1].startswith(".")
         }
 
-    def start(self, largest_file: int = _FREE, arguments: Sequence[str] = ()) -> int:
+    def start(self, largest_file: int = _FREE) -> int:
         """Begin a build in a process and session of its own; gives its number."""
+        store, work = str(self.store), str(self.folder / "work")
+        named = ["build", str(self.product), "--store", store, "--work", work]
         process = os.fork()
         if process == 0:
             status = 70
             try:
                 self._enter(largest_file)
-                store, work = str(self.store), str(self.folder / "work")
-                named = ["build", str(self.product), "--store", store, "--work", work]
-                status = main([*named, *arguments])
+                status = main(named)
             except BaseException:
                 traceback.print_exc()
             finally:
@@ -95,7 +110,7 @@ class Place:
             (self.folder / name).mkdir(parents=True, exist_ok=True)
         os.chdir(self.folder / "home")
         os.environ["TMPDIR"], tempfile.tempdir = str(self.folder / "tmp"), None
-        log = os.open(self.folder.parent / "log", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        log = os.open(self.within / "log", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
         os.dup2(log, 1)
         os.dup2(log, 2)
         resource.setrlimit(resource.RLIMIT_FSIZE, (largest_file, largest_file))
@@ -164,21 +179,23 @@ def let_be(_: int, __: random.Random) -> None:
 
 @dataclass(frozen=True)
 class Disturbance:
-    """How a build is disturbed, the exit statuses with which it may then end, what it starts with.
+    """How a build is disturbed, with which exit statuses it may then end, and which build it is.
 
     `largest_file` is the exponent of two of the largest file, from and to.
     """
 
     disturb: Callable[[int, random.Random], None]
     statuses: tuple[int, ...]
+    in_cluster: bool
     largest_file: tuple[float, float] | None = None
 
 
 HOW = {
-    "all": Disturbance(kill_all, (KILLED, 0)),
-    "build": Disturbance(kill_build, (KILLED, 0)),
-    "worker": Disturbance(kill_worker, (0,)),
-    "disk": Disturbance(let_be, (1,), (4.0, 20.0)),
+    "alone": Disturbance(kill_all, (KILLED, 0), in_cluster=False),
+    "all": Disturbance(kill_all, (KILLED, 0), in_cluster=True),
+    "build": Disturbance(kill_build, (KILLED, 0), in_cluster=True),
+    "worker": Disturbance(kill_worker, (0,), in_cluster=True),
+    "disk": Disturbance(let_be, (1,), in_cluster=False, largest_file=(9.0, 19.9)),
 }
 
 
@@ -193,6 +210,7 @@ class Undisturbed:
     @classmethod
     def of(cls, place: Place) -> Undisturbed:
         """Build, and look."""
+        clear(place.folder)
         begun = time.monotonic()
         place.build()
         seconds = time.monotonic() - begun
@@ -255,24 +273,27 @@ def disturbed(folder: Path, how: Sequence[str], count: int, seed: int) -> Iterat
     Raises AssertionError for the first that leaves what it should not.
     """
     chance = random.Random(seed)
-    place = Place(folder / "out", write_product(folder / "in"))
-    clear(place.folder)
-    expected = Undisturbed.of(place)
+    expected = {}
     for number in range(count):
-        clear(place.folder)
         kind, part = how[number % len(how)], (number + chance.random()) / count
-        process = place.start(largest_file(HOW[kind], part))
-        time.sleep(0.0 if HOW[kind].largest_file else part * expected.seconds)
+        wanted = HOW[kind]
+        place = Place(folder / ("cluster" if wanted.in_cluster else "alone"), wanted.in_cluster)
+        if place not in expected:
+            expected[place] = Undisturbed.of(place)
+        clear(place.folder)
+        process = place.start(largest_file(wanted, part))
+        time.sleep(0.0 if wanted.largest_file else part * expected[place].seconds)
         if not ended(process):
-            HOW[kind].disturb(process, chance)
-        state = check_disturbed(kind, place, expected, waited(process))
+            wanted.disturb(process, chance)
+        state = check_disturbed(kind, place, expected[place], waited(process))
         check_orphans(process)
-        check_next(place, expected)
+        check_next(place, expected[place])
+        clear(place.folder)  # what is read-only would stop who removes it later
         yield Moment(kind, part, state)
 
 
 def largest_file(how: Disturbance, part: float) -> int:
-    """How large files may grow: the least at first, evenly on a logarithmic scale."""
+    """How large files may grow: the least at first, enough for an error, then evenly by factors."""
     if how.largest_file is None:
         return _FREE
     least, most = how.largest_file
@@ -294,13 +315,14 @@ def run() -> None:
     parser.add_argument("--seed", type=int, default=20261122)
     parser.add_argument("--folder", type=Path, help="kept, to look at (default: a temporary one)")
     asked = parser.parse_args()
+    for module in _IMPORTED:
+        importlib.import_module(module)
     with contextlib.ExitStack() as opened:
         folder: Path = asked.folder or Path(opened.enter_context(tempfile.TemporaryDirectory()))
         states: Counter[str] = Counter()
         for moment in disturbed(folder, asked.how, asked.count, asked.seed):
             print(f"{moment.how:8s} at {moment.when:.3f}: {moment.state}", flush=True)
             states[moment.how] += 1
-        clear(folder / "out")  # what is read-only would stop who removes the rest
     print(f"nothing half published, nothing left over: {dict(states)}")
 
 
