@@ -26,6 +26,8 @@ _WORKER_BYTES = 2 << 30
 """Memory that one worker may need: a block of a large map, with what Python itself takes."""
 _PATIENCE_S = 30
 _STARTS = 3
+_WORKERLESS_S = 300
+"""How long a local cluster may be without workers: one that dies as it comes is not replaced."""
 _WORKERS_DIE = "check memory; a script that builds must do so below if __name__ == '__main__':"
 SCRATCH = ".cluster"
 """Name of the folder of a local cluster's own files, in the build's folder."""
@@ -162,7 +164,12 @@ def _local_cluster(scratch: Path) -> Iterator[distributed.Client]:
 
     try:
         with (
-            dask.config.set({"temporary-directory": str(scratch.absolute())}),
+            dask.config.set(
+                {
+                    "temporary-directory": str(scratch.absolute()),
+                    "distributed.scheduler.no-workers-timeout": f"{_WORKERLESS_S}s",
+                }
+            ),
             _started_cluster() as cluster,
             contextlib.closing(distributed.Client(cluster, set_as_default=False)) as client,
         ):
@@ -263,10 +270,11 @@ def _alone(function: Callable[..., Value], arguments: Sequence[Any], after: Sequ
 
 def _result(future: Any) -> Any:
     import distributed
+    from distributed.scheduler import NoWorkerError
 
     try:
         return future.result()
-    except distributed.KilledWorker as caught:
+    except (distributed.KilledWorker, NoWorkerError) as caught:
         raise MagtilesError(
             f"workers died again and again ({caught})",
             remedy=_WORKERS_DIE,
