@@ -13,6 +13,7 @@ from scipy import ndimage
 from magtiles.catalog import Release, open_release
 from magtiles.catalog.flags import QualityFlag
 from magtiles.catalog.releases import versions
+from magtiles.catalog.releases.lattice import Lattice
 from magtiles.pipeline.plotting import QUANTITIES, preview_figure
 from magtiles.pipeline.preview import assemble_level, figure_note, figure_title
 from magtiles.schemas.errors import UsageError
@@ -20,6 +21,11 @@ from magtiles.schemas.errors import UsageError
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+_SIGMAS = {
+    "total": "magnetic_anomaly_uncertainty",
+    "vector": "vector_uncertainty",
+    "tensor": "tensor_uncertainty",
+}
 _NODE = 1e-6  # of a cell: positions nearer than this to a node of the other lattice are that node
 
 
@@ -47,6 +53,25 @@ class LevelChange:
 
 
 @dataclass(frozen=True)
+class SigmaChange:
+    """How a stated 1 sigma changed at one level, over the nodes that both releases answer for.
+
+    Attributes
+    ----------
+    changed : at how many of the `nodes`.
+    median, smallest, largest : of new over old.
+    """
+
+    of: str
+    height_m: float
+    nodes: int
+    changed: int
+    median: float
+    smallest: float
+    largest: float
+
+
+@dataclass(frozen=True)
 class Difference:
     """What changed from an old release to a new one.
 
@@ -55,9 +80,12 @@ class Difference:
     bump, reason : the smallest bump that the change is due (None: nothing changed), and why.
     enough : whether the new release's version is that far above the old one's.
     levels : by level that both have, and quantity.
+    sigmas : by level that both have, and sigma: of the total, the vector, the tensor.
+    flags : by level that both have, how many of the nodes they answer for have other flags.
+    height_references : what heights count from in the old and in the new release.
     only_old, only_new : levels that the other does not have, m.
-    gained, lost : nodes of the old lattice that only the new, or only the old, answers for, at
-        the lowest common level.
+    gained, lost : nodes of the new lattice that only the new release answers for, and of the old
+        one that only the old does, at the lowest common level.
     interpolated : whether the lattices differ, and the new one was interpolated at the old nodes.
     """
 
@@ -67,6 +95,9 @@ class Difference:
     reason: str
     enough: bool
     levels: tuple[LevelChange, ...]
+    sigmas: tuple[SigmaChange, ...]
+    flags: dict[float, int]
+    height_references: tuple[str, str]
     only_old: tuple[float, ...]
     only_new: tuple[float, ...]
     gained: int
@@ -92,6 +123,9 @@ def compare_releases(old: Path, new: Path) -> Difference:
         reason=change.reason,
         enough=_enough(before, after, change.bump),
         levels=levels,
+        sigmas=tuple(one for pair in pairs for one in pair.sigmas()),
+        flags={pair.height: pair.flags_changed() for pair in pairs},
+        height_references=(before.manifest.height_reference, after.manifest.height_reference),
         only_old=tuple(h for h in before.manifest.heights_m if h not in heights),
         only_new=tuple(h for h in after.manifest.heights_m if h not in heights),
         gained=pairs[0].gained if pairs else 0,
@@ -132,6 +166,7 @@ def difference_figure(old: Path, new: Path, *, height: float | None, quantity: s
         quantity=quantity,
         title=title.replace(": ", ": change of "),
         note=figure_note(after.manifest.identity),
+        change=True,
     )
 
 
@@ -143,22 +178,16 @@ class _Level:
         self.lattice = before.manifest.lattice
         self.old = _arrays(before, height)
         self._new = _arrays(after, height)
-        rows = self.lattice.latitudes(np.arange(self.lattice.rows + 1))
-        columns = self.lattice.longitudes(np.arange(self.lattice.columns + 1))
-        self._y, self._x, inside = after.manifest.lattice.locate(
-            *np.broadcast_arrays(rows[:, np.newaxis], columns)
-        )
+        self._y, self._x, inside = _places(self.lattice, after.manifest.lattice)
         self.same_nodes = _on_nodes(self._y[inside]) and _on_nodes(self._x[inside])
-        node = (
-            np.where(inside, np.rint(self._y), 0).astype(np.intp),
-            np.where(inside, np.rint(self._x), 0).astype(np.intp),
-        )
-        self._node = node
-        answers = inside & _covered(self._new["quality_flag"][node])
+        self._node = _nearest(self._y, self._x, inside)
+        answers = inside & _covered(self._new["quality_flag"][self._node])
         answered = _covered(self.old["quality_flag"])
         self.both = answers & answered
-        self.gained = int(np.count_nonzero(answers & ~answered))
         self.lost = int(np.count_nonzero(answered & ~answers))
+        y, x, inside = _places(after.manifest.lattice, self.lattice)
+        known = inside & answered[_nearest(y, x, inside)]
+        self.gained = int(np.count_nonzero(_covered(self._new["quality_flag"]) & ~known))
 
     def change(self, variable: str) -> NDArray[np.float64]:
         """New minus old of a variable, (rows, columns); meaningless where not `both`."""
@@ -172,6 +201,29 @@ class _Level:
 
     def changes(self) -> list[LevelChange]:
         return [self._summary(name) for name in QUANTITIES]
+
+    def sigmas(self) -> list[SigmaChange]:
+        return [
+            self._sigma(name, variable) for name, variable in _SIGMAS.items() if self.both.any()
+        ]
+
+    def _sigma(self, name: str, variable: str) -> SigmaChange:
+        old, new = self.old[variable][self.both], self._new[variable][self._node][self.both]
+        ratio = new.astype(np.float64) / old
+        return SigmaChange(
+            of=name,
+            height_m=self.height,
+            nodes=ratio.size,
+            changed=int(np.count_nonzero(new != old)),
+            median=float(np.median(ratio)),
+            smallest=float(ratio.min()),
+            largest=float(ratio.max()),
+        )
+
+    def flags_changed(self) -> int:
+        """How many nodes that both answer for have other flags."""
+        other = self.old["quality_flag"] != self._new["quality_flag"][self._node]
+        return int(np.count_nonzero(other & self.both))
 
     def _summary(self, quantity: str) -> LevelChange:
         kind = QUANTITIES[quantity]
@@ -200,6 +252,23 @@ def _arrays(release: Release, height: float) -> dict[str, NDArray[Any]]:
     level = release.manifest.heights_m.index(height)
     arrays = assemble_level(release.tiles(), release.manifest.lattice, level, names)
     return dict(zip(names, arrays, strict=True))
+
+
+def _places(
+    nodes: Lattice, on: Lattice
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Where the core nodes of one lattice lie on another, in cells, and whether inside it."""
+    rows = nodes.latitudes(np.arange(nodes.rows + 1))
+    columns = nodes.longitudes(np.arange(nodes.columns + 1))
+    return on.locate(*np.broadcast_arrays(rows[:, np.newaxis], columns))
+
+
+def _nearest(
+    y: NDArray[np.float64], x: NDArray[np.float64], inside: NDArray[np.bool_]
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Index of the nearest node; the first where there is none."""
+    row, column = (np.where(inside, np.rint(one), 0).astype(np.intp) for one in (y, x))
+    return row, column
 
 
 def _covered(flags: NDArray[np.uint8]) -> NDArray[np.bool_]:

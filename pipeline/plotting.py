@@ -71,6 +71,7 @@ def preview_figure(
     quantity: str,
     title: str,
     note: str,
+    change: bool = False,
 ) -> Figure:
     """Draw one level: shaded map, uncertainty, flags.
 
@@ -80,6 +81,7 @@ def preview_figure(
     values, uncertainty, flags : (rows, columns).
     quantity : a key of `QUANTITIES`; says the unit and the labels.
     note : small print below: reference field and epoch, source.
+    change : `values` are changes: all in the range of colours, and no relief over them.
     """
     from matplotlib.figure import Figure
 
@@ -94,7 +96,8 @@ def preview_figure(
     figure = Figure(figsize=layout.size)
     axes = {name: figure.add_axes(box) for name, box in layout.boxes().items()}
     place = (latitude, longitude)
-    _draw_map(axes["map"], axes["map bar"], *place, np.where(shown, values, np.nan), flags, kind)
+    values = np.where(shown, values, np.nan)
+    _draw_map(axes["map"], axes["map bar"], *place, values, flags, kind, change)
     _draw_uncertainty(
         axes["side"], axes["side bar"], *place, np.where(shown, uncertainty, np.nan), kind.unit
     )
@@ -173,15 +176,18 @@ def _draw_map(
     values: NDArray[np.floating[Any]],
     flags: NDArray[np.uint8],
     kind: Quantity,
+    change: bool,
 ) -> None:
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
-    limit = _robust_limit(values)
+    largest = float(np.nanmax(np.abs(values), initial=0.0))
+    limit = (largest or 1.0) if change else _robust_limit(values)
     colours = ScalarMappable(Normalize(-limit, limit), "RdBu_r")
     picture = colours.to_rgba(values)
-    shade = hillshade(latitude, longitude, values)
-    picture[..., :3] = _lit(picture[..., :3], shade[..., np.newaxis])
+    if not change:
+        shade = hillshade(latitude, longitude, values)
+        picture[..., :3] = _lit(picture[..., :3], shade[..., np.newaxis])
     picture[np.isnan(values)] = (1.0, 1.0, 1.0, 0.0)
     smooth = "bilinear" if max(values.shape) < _SMOOTH_BELOW else "auto"
     _show(axes, latitude, longitude, picture, ticks=5, interpolation=smooth)
@@ -190,14 +196,13 @@ def _draw_map(
     _outline(axes, latitude, longitude, beyond, "solid")
     _outline(axes, latitude, longitude, filled & ~beyond, "dotted")
     _scale_bar(axes, latitude, longitude)
-    clipped = bool(np.nanmax(np.abs(values), initial=0.0) > limit)
     bar = axes.figure.colorbar(
         colours,
         cax=bar_axes,
         orientation="horizontal",
-        extend="both" if clipped else "neither",
+        extend="both" if largest > limit else "neither",
     )
-    bar.set_label(f"{kind.label} ({kind.unit})")
+    bar.set_label(f"{'change of ' if change else ''}{kind.label} ({kind.unit})")
 
 
 def _robust_limit(values: NDArray[np.floating[Any]]) -> float:

@@ -55,10 +55,22 @@ def _print(found: Difference) -> None:
     for heights, which in ((found.only_old, "old"), (found.only_new, "new")):
         if heights:
             print(f"levels of the {which} one only: {', '.join(f'{h:g}' for h in heights)} m")
+    if len(set(found.height_references)) > 1:
+        old, new = (one.replace("_", " ") for one in found.height_references)
+        print(f"heights count from {old} in the old, {new} in the new: equal numbers are compared")
     if found.gained or found.lost:
         print(f"coverage: {found.gained} nodes gained, {found.lost} lost")
     if found.interpolated:
         print("the lattices differ: the new one was interpolated at the old one's nodes")
+    if found.bump is not None and found.levels:
+        _print_values(found)
+        _print_sigmas(found)
+        for height, count in found.flags.items():
+            if count:
+                print(f"flags changed at {count} nodes of level {height:g}")
+
+
+def _print_values(found: Difference) -> None:
     rows = [
         (
             f"{one.height_m:g}",
@@ -71,7 +83,27 @@ def _print(found: Difference) -> None:
             "-" if one.latitude is None else f"{one.latitude:.5f}, {one.longitude:.5f}",
         )
         for one in found.levels
+        if one.changed
     ]
-    if found.bump is not None and rows:
+    if rows:
         header = ("height", "quantity", "changed", "rms", "largest", "unit", "sigmas", "where")
         print_table(header, rows)
+    else:
+        print("total, vector and tensor: no value changed")
+
+
+def _print_sigmas(found: Difference) -> None:
+    rows = [
+        (
+            f"{one.height_m:g}",
+            one.of,
+            f"{one.changed / one.nodes:.1%}",
+            f"{one.median:.4g}",
+            f"{one.smallest:.4g}",
+            f"{one.largest:.4g}",
+        )
+        for one in found.sigmas
+        if one.changed
+    ]
+    if rows:
+        print_table(("height", "1 sigma of", "changed", "new/old", "least", "most"), rows)

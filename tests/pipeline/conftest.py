@@ -224,6 +224,14 @@ def finer_release(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return build_release(tmp_path / "finer")
 
 
+@pytest.fixture
+def wider_release(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The same field on the same lattice with two columns of cells more in the east."""
+    wider = dataclasses.replace(LATTICE, columns=LATTICE.columns + 2)
+    monkeypatch.setitem(globals(), "LATTICE", wider)
+    return build_release(tmp_path / "wider")
+
+
 @pytest.fixture(scope="session")
 def terrain_release(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The release as if its heights counted from a terrain of unknown height."""

@@ -61,6 +61,48 @@ def test_coverage_gained(exact_release: Path, spoilt_release: Callable) -> None:
     assert (back.gained, back.lost) == (0, rows + 1)
 
 
+def test_what_changed_in_sigma_and_flags_is_told(
+    exact_release: Path, spoilt_release: Callable, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The values are the same, and the bump would be without a reason in nT."""
+
+    def change(row, column, arrays):
+        arrays["vector_uncertainty"][0] *= np.float32(2.0)
+        if (row, column) == (0, 0):
+            arrays["quality_flag"][1, HALO + 3, HALO + 4] |= QualityFlag.POORLY_LEVELLED
+
+    new = spoilt_release(change)
+    found = compare_releases(exact_release, new)
+    low, high = read_manifest(exact_release).heights_m[:2]
+    (one,) = [one for one in found.sigmas if one.changed]
+    assert (one.of, one.height_m, one.changed) == ("vector", low, one.nodes)
+    assert (one.median, one.smallest, one.largest) == (2.0, 2.0, 2.0)
+    assert {height: count for height, count in found.flags.items() if count} == {high: 1}
+    assert main(["diff", str(exact_release), str(new)]) == 1
+    printed = capsys.readouterr().out
+    assert "total, vector and tensor: no value changed" in printed
+    assert f"flags changed at 1 nodes of level {high:g}" in printed
+    assert "new/old" in printed
+
+
+def test_heights_from_another_surface_are_named(
+    exact_release: Path, terrain_release: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["diff", str(exact_release), str(terrain_release)]) == 1
+    assert "heights count from ellipsoid in the old, terrain in the new" in capsys.readouterr().out
+
+
+def test_coverage_beyond_the_old_lattice_is_gained(
+    exact_release: Path, wider_release: Path
+) -> None:
+    """Two columns of cells more in the east; the old release has no nodes there."""
+    found = compare_releases(exact_release, wider_release)
+    lattice = read_manifest(exact_release).lattice
+    assert found.lost == 0
+    assert found.gained >= 2 * (lattice.rows + 1)
+    assert not found.interpolated
+
+
 def test_another_lattice_is_interpolated(exact_release: Path, finer_release: Path) -> None:
     """The same field on both: what is left is the interpolation's error, 0.3 % of the rms."""
     found = compare_releases(exact_release, finer_release)
