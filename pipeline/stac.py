@@ -157,6 +157,7 @@ def _item(
     latitude, longitude = lattice.tile_axes(tile.row, tile.column)
     steps = lattice.latitude_spacing, lattice.longitude_spacing
     ProjectionExtension.ext(asset).apply(
+        code="EPSG:4326",  # else the asset's own would be null, which goes before the item's
         shape=[latitude.size, longitude.size],
         # Of cells around the nodes, rows from the south, halo and all, as the file has them.
         transform=[

@@ -79,6 +79,7 @@ def test_items_say_where_and_what_they_are(collection: pystac.Collection, folder
     assert item is not None
     asset = item.assets["data"].extra_fields
     arrays = tiles[1, 2].variables
+    assert asset["proj:code"] == item.properties["proj:code"] == "EPSG:4326"
     assert asset["proj:shape"] == list(arrays["quality_flag"].shape[1:])
     a, _, west, _, e, south = asset["proj:transform"]
     for axis, start, step in (("longitude", west, a), ("latitude", south, e)):
