@@ -115,12 +115,15 @@ def _preview(release: Release, path: str) -> str:
 
 
 def _caption(stem: str) -> str:
-    """The picture's own name, or for an observatory its code and what is drawn."""
-    if not stem.startswith("temporal-"):
-        return stem
-    code, _, kind = stem.removeprefix("temporal-").partition("-")
-    words = kind.replace("sigma-tau", "sigma and tau").replace("-", " ")
-    return f"Observatory {code}: {words}"
+    """What a picture of a level, an observatory or a road shows, by its name."""
+    if stem.startswith("temporal-"):
+        code, _, kind = stem.removeprefix("temporal-").partition("-")
+        words = kind.replace("sigma-tau", "sigma and tau").replace("-", " ")
+        return f"Observatory {code}: {words}"
+    if stem.startswith("road-"):
+        road, _, kind = stem.removeprefix("road-").rpartition("-")
+        return f"Road {road}: {kind}"
+    return f"Level {stem.removesuffix('m')} m: total-field anomaly, its uncertainty and flags"
 
 
 def _or_problem(make: Callable[[], str]) -> str:

@@ -12,6 +12,7 @@ import pytest
 
 from magtiles.catalog.releases.manifest import read_manifest
 from magtiles.pipeline.main import main
+from magtiles.pipeline.report import _caption
 from magtiles.pipeline.report_figures import radial_power
 
 
@@ -98,3 +99,15 @@ class TestRadialPower:
         y = 500.0 * np.arange(256)[:, None] * np.ones(256)
         wavelength, power = radial_power(np.sin(2 * np.pi * y / 16_000.0), (500.0, 500.0))
         assert wavelength[np.argmax(power)] == pytest.approx(16_000.0, rel=0.07)
+
+
+@pytest.mark.parametrize(
+    ("stem", "caption"),
+    [
+        ("1500m", "Level 1500 m: total-field anomaly, its uncertainty and flags"),
+        ("temporal-BOU-sigma-tau", "Observatory BOU: sigma and tau"),
+        ("road-high-street-backward-field", "Road high-street-backward: field"),
+    ],
+)
+def test_captions_are_words(stem: str, caption: str) -> None:
+    assert _caption(stem) == caption
