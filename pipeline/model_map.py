@@ -2,41 +2,23 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from magtiles.catalog.kernels.bspline import HALO
 from magtiles.catalog.models import shc_text
-from magtiles.catalog.releases.lattice import Lattice
 from magtiles.pipeline import receipts
-from magtiles.pipeline.product import ModelMap, ModelTable
+from magtiles.pipeline.harmonic_lattice import GLOBE, check_halo, harmonic_spacing
+from magtiles.pipeline.product import ModelMap
 from magtiles.pipeline.steps import MapPlan, Steps, node_axes
 from magtiles.pipeline.survey_map import check_gaps
-from magtiles.schemas.errors import ParameterError, SourceError
+from magtiles.schemas.errors import SourceError
 from magtiles.stages.field import model_components
-from magtiles.stages.field.model_components import (
-    ModelPartsParams,
-    model_parts,
-    shortest_wavelength_m,
-)
+from magtiles.stages.field.model_components import ModelPartsParams, model_parts
 from magtiles.stages.field.model_parts import ModelParts
 from magtiles.stages.release.atomic import write_bytes
-from magtiles.stages.release.plan import POLAR_LIMIT, Bounds, plan_lattice
-
-_log = logging.getLogger(__name__)
-
-_NODES_A_WAVE = 8.0
-"""Default nodes on the shortest wave: a cubic spline then errs by 0.04 % of that wave."""
-_COARSE, _NYQUIST = 4.0, 2.0
-"""Nodes on the shortest wave below which a spline errs by 0.6 % of it and more, and by all."""
-
-_METRES_A_DEGREE = 110_574.0
-"""Least length of a degree of latitude."""
-
-_GLOBE: Bounds = (-POLAR_LIMIT, POLAR_LIMIT, -180.0, 180.0)
+from magtiles.stages.release.plan import plan_lattice
 
 
 @dataclass(frozen=True)
@@ -63,9 +45,10 @@ def plan_model_map(source: ModelMap, folder: Path, data: Path | None, steps: Ste
     }
     inputs = [*files.toml, *files.data]
     parts, _ = model_parts(inputs, source.core, ModelPartsParams(**chosen))
-    bounds = _GLOBE if wanted.region is None else wanted.region.bounds
-    lattice = plan_lattice(bounds, _spacing(wanted, parts, bounds), wanted.tile_deg, table="model")
-    _check_halo(lattice)
+    bounds = GLOBE if wanted.region is None else wanted.region.bounds
+    spacing = harmonic_spacing(wanted.spacing_m, parts.crust.n_max, bounds, "model")
+    lattice = plan_lattice(bounds, spacing, wanted.tile_deg, table="model")
+    check_halo(lattice, "model")
     heights = sorted(wanted.heights_m)
     check_gaps(heights, "model.heights_m")
     core_field = folder / "core_field.shc"
@@ -137,40 +120,3 @@ def _core_text(parts: ModelParts) -> str:
         f"{parts.core.name}, degrees {parts.core.n_min} to {parts.core.n_max}: the core field "
         "that this release's anomaly counts from",
     )
-
-
-def _spacing(wanted: ModelTable, parts: ModelParts, bounds: Bounds) -> float:
-    """Node spacing, m: as asked, or what the shortest wave and the room to the pole allow."""
-    degree = parts.crust.n_max
-    wave = shortest_wavelength_m(degree)
-    if wanted.spacing_m is None:
-        farthest = max(abs(bounds[0]), abs(bounds[1]))
-        room = max(90.0 - farthest, 90.0 - POLAR_LIMIT) / (HALO + 1) * _METRES_A_DEGREE
-        return min(wave / _NODES_A_WAVE, room)
-    if wanted.spacing_m > wave / _NYQUIST:
-        raise ParameterError(
-            f"nodes {wanted.spacing_m:g} m apart cannot hold degree {degree}",
-            where="model.spacing_m",
-            expected=f"at most {wave / _NYQUIST:.0f} m (Nyquist), better {wave / _COARSE:.0f}",
-            remedy="lower it, or lower highest_degree",
-        )
-    if wanted.spacing_m > wave / _COARSE:
-        _log.warning(
-            "spacing_m %g leaves less than four nodes on the shortest wave of degree %d: "
-            "interpolation errs by 0.6 %% of it and more; %.0f m would do",
-            wanted.spacing_m, degree, wave / _COARSE,
-        )  # fmt: skip
-    return wanted.spacing_m
-
-
-def _check_halo(lattice: Lattice) -> None:
-    """Raise ParameterError where the halo would pass a pole."""
-    reach = HALO * lattice.latitude_spacing
-    if max(-lattice.south, lattice.north) + reach > 90.0:
-        room = (90.0 - max(-lattice.south, lattice.north)) / HALO * _METRES_A_DEGREE
-        raise ParameterError(
-            f"{HALO} nodes beyond {lattice.south:g} to {lattice.north:g} degrees reach over a pole",
-            where="model.spacing_m",
-            expected=f"nodes at most {room:.0f} m apart there",
-            remedy="lower spacing_m, or set a smaller region.latitude",
-        )

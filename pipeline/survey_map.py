@@ -1,4 +1,8 @@
-"""The map of a survey: ingested, cropped, filled, and continued to every level."""
+"""The map of a survey: ingested, cropped, filled, and continued to every level.
+
+One that goes all around the globe is neither cropped nor filled: its harmonics are fitted to what
+was measured.
+"""
 
 from __future__ import annotations
 
@@ -9,16 +13,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import xarray as xr
 
 from magtiles.catalog.releases.lattice import Lattice
 from magtiles.pipeline.artifacts import open_artifact
+from magtiles.pipeline.harmonic_lattice import GLOBE, check_halo, harmonic_spacing
 from magtiles.pipeline.large_levels import LevelJob, LevelTasks, begin
 from magtiles.pipeline.product import AnomalyTable, SurveyMap
 from magtiles.pipeline.source_paths import data_files, manifest_inputs
 from magtiles.pipeline.steps import MapPlan, Steps, node_axes
 from magtiles.pipeline.tasks import Tasks
 from magtiles.schemas.errors import CoverageError, ParameterError
-from magtiles.stages.field import components, crop, voids
+from magtiles.stages.field import components, crop, sphere, voids
 from magtiles.stages.field.extent import data_bounds
 from magtiles.stages.field.geometry import true_spacing
 from magtiles.stages.ingest import grid as ingest
@@ -34,13 +40,23 @@ _LEAST_GAP_M = 1.0
 
 @dataclass(frozen=True)
 class Survey:
-    """A survey ready to be continued: where its grid lies, its surface and its cell (m)."""
+    """A survey ready to be continued: where its grid lies, its surface and its cell (m).
 
-    grid: Path
+    `artifacts` were made on the way. `degree` is the highest harmonic of a survey that goes all
+    around the globe, none of others.
+    """
+
+    artifacts: Sequence[Path]
     height_m: float
     cell_m: float
     bounds: Bounds
     reference_field: str
+    degree: int | None = None
+
+    @property
+    def grid(self) -> Path:
+        """The last of the artifacts."""
+        return self.artifacts[-1]
 
 
 def plan_survey_map(source: SurveyMap, folder: Path, data: Path | None, steps: Steps) -> MapPlan:
@@ -52,20 +68,18 @@ def plan_survey_map(source: SurveyMap, folder: Path, data: Path | None, steps: S
     wanted, files = source.table, data_files(source.source, data)
     survey = _survey(wanted, [source.path, *files], folder, steps)
     heights = _heights(wanted, survey.height_m)
-    spacing = wanted.spacing_m or _default_spacing(survey, heights)
-    lattice = plan_lattice(survey.bounds, spacing, wanted.tile_deg)
+    lattice = _lattice(wanted, survey, heights)
     inputs = manifest_inputs(source.source, files, "survey")
     surface: list[Path] = []
     if source.surface is not None:
         surface = source.surface.lay(survey.grid, lattice, folder, data, steps)
         inputs += source.surface.inputs(data)
-    names = ["survey.nc", *(["cropped.nc"] if wanted.region is not None else []), "filled.nc"]
     levels = Levels(wanted, survey, lattice, folder, steps)
     return MapPlan(
         lattice=lattice,
         heights=heights,
         level=levels.make,
-        artifacts=[*(folder / name for name in names), *surface],
+        artifacts=[*survey.artifacts, *surface],
         inputs=inputs,
         source=source.path,
         core_field=igrf_coefficients(survey.reference_field),
@@ -75,24 +89,52 @@ def plan_survey_map(source: SurveyMap, folder: Path, data: Path | None, steps: S
 
 
 def _survey(wanted: AnomalyTable, files: Sequence[Path], folder: Path, steps: Steps) -> Survey:
-    """Ingest, crop and fill."""
+    """Ingest, crop and fill; a survey of the globe is ingested only."""
     grid = steps.run(ingest.STAGE, {"files": files}, folder / "survey.nc", {})
+    artifacts = [grid]
+    region = wanted.region
+    around = region is None or region.bounds[3] - region.bounds[2] >= 360.0
     with open_artifact(grid) as opened:
         height, cell = float(np.mean(opened["height"])), min(true_spacing(opened))
         reference_field = str(opened.attrs["reference_field"])
         _check_reference(wanted, str(opened.attrs["height_reference"]))
-    region = wanted.region
+        if around and sphere.is_globe(opened):
+            bounds = _data_parallels(opened) if region is None else region.bounds
+            degree = sphere.resolved_degree(opened)
+            return Survey(artifacts, height, cell, bounds, reference_field, degree)
     if region is not None:
         gain = max(abs(h - height) for h in wanted.heights_m)
         margin = max(_MARGIN_HEIGHTS * gain, min(_MARGIN_CELLS * cell, _MARGIN_CELLS_M))
         limits = {"latitude": region.latitude, "longitude": region.longitude, "margin_m": margin}
         grid = steps.run(crop.STAGE, {"grid": grid}, folder / "cropped.nc", limits)
+        artifacts.append(grid)
         bounds = region.bounds
     else:
         with open_artifact(grid) as opened:
             bounds = data_bounds(opened)
-    filled = steps.run(voids.STAGE, {"grid": grid}, folder / "filled.nc", {})
-    return Survey(filled, height, cell, bounds, reference_field)
+    artifacts.append(steps.run(voids.STAGE, {"grid": grid}, folder / "filled.nc", {}))
+    return Survey(artifacts, height, cell, bounds, reference_field)
+
+
+def _data_parallels(globe: xr.Dataset) -> Bounds:
+    """The globe between its outermost parallels with data, or 85 degrees."""
+    known = np.isfinite(globe["magnetic_anomaly"].values).any(axis=1)
+    latitude = globe["latitude"].values[known]
+    south, north, west, east = GLOBE
+    if not latitude.size:
+        return GLOBE
+    return max(south, float(latitude[0])), min(north, float(latitude[-1])), west, east
+
+
+def _lattice(wanted: AnomalyTable, survey: Survey, heights: Sequence[float]) -> Lattice:
+    """Where the nodes of the release are."""
+    if survey.degree is None:
+        spacing = wanted.spacing_m or _default_spacing(survey, heights)
+        return plan_lattice(survey.bounds, spacing, wanted.tile_deg)
+    spacing = harmonic_spacing(wanted.spacing_m, survey.degree, survey.bounds, "anomaly")
+    lattice = plan_lattice(survey.bounds, spacing, wanted.tile_deg)
+    check_halo(lattice, "anomaly")
+    return lattice
 
 
 def _check_reference(wanted: AnomalyTable, of_survey: str) -> None:
@@ -153,7 +195,7 @@ class Levels:
     @property
     def are_large(self) -> bool:
         """Whether they are made block by block."""
-        return self._job(self._survey.height_m).is_large
+        return self._survey.degree is None and self._job(self._survey.height_m).is_large
 
     def begin(self, tasks: Tasks, heights: Sequence[float]) -> None:
         """Ask for the blocks of all levels, lowest first: none waits while one is put together."""
@@ -162,6 +204,10 @@ class Levels:
 
     def make(self, height: float) -> Path:
         """The level of one height."""
+        if self._survey.degree is not None:
+            globe = {"globe": self._survey.grid}
+            params = {k: v for k, v in self._params(height).items() if k != "block_nodes"}
+            return self._steps.run(sphere.STAGE, globe, self._out(height), params)
         job = self._job(height)
         if height not in self._begun:
             return self._steps.run(
@@ -174,8 +220,10 @@ class Levels:
         return job.out
 
     def _job(self, height: float) -> LevelJob:
-        out = self._folder / f"level-{height:.12g}m.nc"
-        return LevelJob.of(self._survey.grid, self._params(height), out)
+        return LevelJob.of(self._survey.grid, self._params(height), self._out(height))
+
+    def _out(self, height: float) -> Path:
+        return self._folder / f"level-{height:.12g}m.nc"
 
     def _params(self, height: float) -> dict[str, Any]:
         params: dict[str, Any] = {
