@@ -39,7 +39,12 @@ class ReleaseChecks(pytest.Collector):
 
     def collect(self) -> Iterator[pytest.Item]:
         """Validate the release; what cannot be read is a check that fails."""
-        from magtiles.pipeline.validate import validate_release
+        try:
+            from magtiles.pipeline.validate import validate_release
+        except ModuleNotFoundError as missing:
+            raise pytest.UsageError(
+                f'--magtiles-release needs {missing.name}: pip install "magtiles[pipeline]"'
+            ) from None
 
         for check in validate_release(Path(self.name)):
             yield CheckItem.from_parent(self, name=check.name, check=check)

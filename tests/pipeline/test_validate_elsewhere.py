@@ -61,3 +61,19 @@ def test_plugin_of_no_release(pytester: pytest.Pytester, tmp_path: Path) -> None
     result = pytester.runpytest_subprocess(f"--magtiles-release={tmp_path}")
     assert result.ret == 1
     result.stdout.fnmatch_lines(["*manifest*"])
+
+
+def test_plugin_without_the_extra(pytester: pytest.Pytester, exact_release: Path) -> None:
+    """Where only the reader is installed the option says what is missing, not where it crashed."""
+    pytester.makeconftest(
+        "import sys\n"
+        "class Missing:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name == 'xarray':\n"
+        "            raise ModuleNotFoundError('none', name=name)\n"
+        "sys.meta_path.insert(0, Missing())\n"
+    )
+    result = pytester.runpytest_subprocess(f"--magtiles-release={exact_release}")
+    assert result.ret == pytest.ExitCode.USAGE_ERROR
+    result.stderr.fnmatch_lines(['*needs xarray: pip install "magtiles?pipeline?"*'])
+    assert "INTERNALERROR" not in result.stdout.str()
