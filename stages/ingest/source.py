@@ -18,6 +18,9 @@ from magtiles.stages.ingest.raw import ELEVATION, FLUX_DENSITY, Quantity
 TOTAL_FIELD_ANOMALY = "total-field anomaly: |F| minus the reference field's magnitude"
 
 
+_Column = Annotated[int, pydantic.Field(ge=1)]
+
+
 def _rising(band: tuple[float, float]) -> tuple[float, float]:
     if not 0 <= band[0] < band[1]:
         raise ValueError("two wavelengths in km, the shorter first")
@@ -46,7 +49,7 @@ class GridFileParams(Params):
     member: str | None = quantity(
         "1", default=None, doc="File of a zip archive that holds several."
     )
-    columns: tuple[int, int, int] = quantity(
+    columns: tuple[_Column, _Column, _Column] = quantity(
         "1", default=(1, 2, 3), doc="Columns of x, y and value of a text grid, counted from 1."
     )
     allow_ballpark_datum: bool = quantity(

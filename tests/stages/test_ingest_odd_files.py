@@ -293,6 +293,17 @@ def test_text_that_is_no_number_is_named(tmp_path: Path) -> None:
         read([path], **_GEO)
 
 
+def test_columns_count_from_one(tmp_path: Path) -> None:
+    toml = tmp_path / "a.toml"
+    toml.write_text(
+        '[source]\nid = "a"\nkind = "anomaly-grid"\nfiles = ["grid.xyz"]\nlicence = "own"\n'
+        "[grid]\ncolumns = [0, 1, 2]\n"
+    )
+    text(" ")(tmp_path)
+    with pytest.raises(SourceError, match=r"a\.toml \[grid\].*columns.*greater than or equal to 1"):
+        ingest_grid([toml], params=IngestGridParams())
+
+
 class TestUncertaintyMarks:
     """EMAG2 version 3 writes -888 and -999 where it states no error."""
 
