@@ -103,7 +103,7 @@ $(LOCKED): $(LOCK)
 	  echo "magtiles needs Python 3.11, 3.12 or 3.13, and $(PYTHON) is none of them:" \
 	    "name one, as in make PYTHON=python3.12" >&2; exit 1; }
 	$(PYTHON) -m venv --clear $(VENV)
-	$(BIN)/python -m $(PIP) install --require-hashes --requirement $(LOCK)
+	$(BIN)/python -m $(PIP) install --no-compile --require-hashes --requirement $(LOCK)
 	@touch $@
 
 # Nothing is built in isolation: the build backend is in the lock too.
