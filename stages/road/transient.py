@@ -18,7 +18,7 @@ _SEED = 2.6
 """Standard deviations, all along that length, at which a difference is no scatter, and"""
 _EDGE = 1.2
 """those down to which it belongs to the same disturbance."""
-_APART_M = 0.5
+_APART_M = 1.0
 """Two passes lie this far apart even when aligned, in lane and place: steep fields differ."""
 _NEAR_M = 2.0
 _CALIBRATION = 0.2

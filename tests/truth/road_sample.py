@@ -76,10 +76,9 @@ class Truth:
 
     road: Road
 
-    def at(self, latitude: Floats, longitude: Floats, direction: str) -> Floats:
-        """At the places (point,) of a map driven in a direction, nT (point, 3)."""
-        lane = self.road.lane
-        route = self.road.route
+    def at(self, latitude: Floats, longitude: Floats, heading: Floats) -> Floats:
+        """At places (point,) of a map, driven toward headings in degrees, nT (point, 3)."""
+        lane, route = self.road.lane, self.road.route
         plane = pyproj.Transformer.from_crs(
             "EPSG:4326",
             pyproj.CRS.from_dict(
@@ -89,22 +88,17 @@ class Truth:
             always_xy=True,
         )  # fmt: skip
         east, north = plane.transform(longitude, latitude)
-        place = np.column_stack([north, east])
-        # Over a chord: points at the ends, of few passes, may lie beside the others.
-        number = np.arange(len(place))
-        step = place[np.minimum(number + 10, len(place) - 1)] - place[np.maximum(number - 10, 0)]
-        course = np.arctan2(step[:, 1], step[:, 0])
-        if direction == "backward":
-            course += np.pi
-        along = np.arange(0.0, lane.distance[-1], _STEPS_M)
-        lane_north, lane_east, heading = lane.at(along)
+        lane_north, lane_east, course = lane.at(np.arange(0.0, lane.distance[-1], _STEPS_M))
         # Both lanes of the road are near: only the one driven this way counts.
-        turned = np.column_stack([np.cos(heading), np.sin(heading)]) * 50.0
-        tree = cKDTree(np.column_stack([lane_north, lane_east, turned]))
-        own = np.column_stack([np.cos(course), np.sin(course)]) * 50.0
-        nearest = tree.query(np.column_stack([place, own]))[1]
+        tree = cKDTree(_turned(lane_north, lane_east, course))
+        nearest = tree.query(_turned(north, east, np.radians(heading)))[1]
         field = self.road.field(lane_north[nearest], lane_east[nearest], _ABOVE_M)
-        return levelled(field, heading[nearest])
+        return levelled(field, course[nearest])
+
+
+def _turned(north: Floats, east: Floats, course: Floats) -> Floats:
+    """Places with courses, radians, as two more coordinates: the other way is as ten metres."""
+    return np.column_stack([north, east, 5.0 * np.cos(course), 5.0 * np.sin(course)])
 
 
 @dataclass(frozen=True)
@@ -143,9 +137,8 @@ def closeness(name: str, roads: Path) -> Closeness:
     def errors(road_map: xr.Dataset) -> tuple[Floats, NDArray[np.bool_]]:
         number = np.rint(road_map["distance"].values / road_map.attrs["spacing_m"]).astype(int)
         kept = np.isin(number, list(shared))
-        where = (road_map[name].values for name in ("latitude", "longitude"))
-        true = truth.at(*where, road_map.attrs["direction"])
-        return (road_map["field_body"].values - true)[kept], kept
+        where = (road_map[name].values for name in ("latitude", "longitude", "heading"))
+        return (road_map["field_body"].values - truth.at(*where))[kept], kept
 
     error, kept = errors(merged)
     return Closeness(
