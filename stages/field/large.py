@@ -28,7 +28,8 @@ Real = NDArray[np.float64]
 
 LARGEST = 4096 * 4096
 """Nodes of a map that is still transformed at once, and half those of a level made at once."""
-BLOCK_NODES = 2048
+BLOCK_NODES = 1024
+"""Of a block a side: with larger ones margins weigh less, but arrays leave the caches."""
 _METRES_PER_DEGREE = 111_195.0
 _STRIP = 512
 """Rows of a level that are put together at a time."""

@@ -3,7 +3,10 @@
 ``bench_blocks.py`` does all; name parts of it (``compare``, ``sizes``, ``workers``) to do those.
 A map of 3000 x 3000 nodes, with a void and a coast, is made at once and in blocks, and compared
 everywhere. Builds of 1024 to 8192 nodes a side, five levels each, run in processes of their
-own; what they hold in memory is what no other process shares with them, workers included.
+own, with two workers; each has built a small map before, so that starting and importing do not
+count. What they cost is in seconds of a processor, user's and system's, workers included: the same
+whatever else the machine does. What they hold in memory is what no other process shares with
+them. Name sizes after ``sizes`` to do only those.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import bench_chain
+import dask
 import distributed
 import numpy as np
 import psutil
@@ -36,6 +40,7 @@ LOW = {"inclination_deg": 8.0, "declination_deg": 37.0}
 SIZES = (1024, 2048, 4096, 8192)
 LEVELS_M = (800.0, 1300.0, 2300.0, 4300.0)
 WORKERS_SIZE, WORKERS_BLOCK = 3000, 1024
+WARM_SIZE, WARM_BLOCK = 400, 200
 
 
 def example() -> xr.Dataset:
@@ -108,56 +113,66 @@ def report(gain: float, one: xr.Dataset, blocked: xr.Dataset) -> None:
     )
 
 
-def sizes() -> None:
-    """Time and memory of builds by size."""
-    print(f"builds of {1 + len(LEVELS_M)} levels")
+def sizes(*wanted: int) -> None:
+    """Cost and memory of builds by size."""
+    print(f"builds of {1 + len(LEVELS_M)} levels, two workers")
     first = None
-    for size in SIZES:
-        made = in_process(size, None, None)
-        cell = made["seconds"] / size**2
+    for size in wanted or SIZES:
+        made = in_process(size, None, 2)
+        spent, cell = made["processor_s"], made["processor_s"] / size**2
         first = first or cell
         print(
-            f"  {size:5} a side: {made['seconds']:7.1f} s, {1e6 * cell:6.2f} us a cell "
-            f"({cell / first:.2f} of the first; asked: 0.8 to 1.2), at most "
-            f"{made['whole_gb']:.2f} GB, {made['own_gb']:.2f} in the build's own process and "
-            f"{made['worker_gb']:.2f} in a worker (asked at 4096: below 4)",
-            {step: round(seconds, 1) for step, seconds in made["steps"].items()},
+            f"  {size:5} a side: {spent:7.1f} s of a processor in {made['seconds']:7.1f} s, "
+            f"{1e6 * cell:6.2f} us a cell ({cell / first:.2f} of the first; asked: 0.8 to 1.2), "
+            f"at most {made['whole_gb']:.2f} GB, {made['own_gb']:.2f} in the build's own process "
+            f"and {made['worker_gb']:.2f} in a worker (asked at 4096: below 4)",
+            {step: [round(s, 1) for s in both] for step, both in made["steps"].items()},
             flush=True,
         )
 
 
 def workers() -> None:
     """Time of one build in blocks by one worker, and by two."""
-    seconds = {}
-    for count in (1, 2):
-        with distributed.LocalCluster(
-            n_workers=count, threads_per_worker=1, dashboard_address="127.0.0.1:0", memory_limit=0
-        ) as cluster:
-            made = in_process(WORKERS_SIZE, WORKERS_BLOCK, cluster.scheduler_address)
-        seconds[count] = made["steps"]["derive-components"] + made["steps"]["cutting tiles"]
-        print(f"  {count} workers: {made['seconds']:.1f} s, tasks {seconds[count]:.1f} s")
-    print(f"two workers are {seconds[1] / seconds[2]:.2f} times as fast (asked: at least 1.6)")
+    made = [in_process(WORKERS_SIZE, WORKERS_BLOCK, count) for count in (1, 2)]
+    for count, found in enumerate(made, 1):
+        steps = {step: [round(s, 1) for s in both] for step, both in found["steps"].items()}
+        print(f"  {count} workers: {found['seconds']:.1f} s, of it (and of a processor) {steps}")
+    one, two = (found["seconds"] for found in made)
+    print(f"two workers are {one / two:.2f} times as fast (asked: at least 1.6)")
 
 
-def in_process(size: int, block: int | None, scheduler: str | None) -> dict[str, Any]:
+def in_process(size: int, block: int | None, count: int) -> dict[str, Any]:
     """What `build` prints, in a process of its own."""
-    command = [sys.executable, __file__, "build", json.dumps([size, block, scheduler])]
+    command = [sys.executable, __file__, "build", json.dumps([size, block, count])]
     printed = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
     made: dict[str, Any] = json.loads(printed.splitlines()[-1])
     return made
 
 
-def build(size: int, block: int | None, scheduler: str | None) -> None:
-    """Build a map of that size and print, as JSON, what it took."""
+def build(size: int, block: int | None, count: int) -> None:
+    """Build a map of that size with so many workers and print, as JSON, what it took."""
+    with (
+        dask.config.set({"distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": None}),
+        distributed.LocalCluster(
+            n_workers=count, threads_per_worker=1, dashboard_address="127.0.0.1:0", memory_limit=0
+        ) as cluster,
+    ):
+        built(WARM_SIZE, WARM_BLOCK, cluster.scheduler_address)
+        print(json.dumps(built(size, block, cluster.scheduler_address)))
+
+
+def built(size: int, block: int | None, scheduler: str) -> dict[str, Any]:
+    """What it took to build a map of that size."""
     bench_chain.SIZE = size
-    steps: dict[str, float] = {}
-    last: list[Any] = [0.0, "start"]
+    steps: dict[str, list[float]] = {}
+    last: list[Any] = [0.0, 0.0, "start"]
 
     def progress(what: str, done: int, total: int) -> None:
-        now = time.perf_counter()
+        now = time.perf_counter(), processor_s()
         what = "derive-components" if what.startswith("blocks of") else what
-        steps[last[1]] = steps.get(last[1], 0.0) + now - last[0]
-        last[:] = now, what
+        spent = steps.setdefault(last[2], [0.0, 0.0])
+        steps[last[2]] = [s + n - m for s, n, m in zip(spent, now, last[:2], strict=True)]
+        last[:] = *now, what
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -165,7 +180,7 @@ def build(size: int, block: int | None, scheduler: str | None) -> None:
         text = product.read_text().replace(str(list(bench_chain.LEVELS_M)), str(list(LEVELS_M)))
         product.write_text(text + (f"block_nodes = {block}\n" if block else ""))
         with Watch() as memory:
-            start = last[0] = time.perf_counter()
+            last[:] = time.perf_counter(), processor_s(), "start"
             result = build_product(
                 product,
                 store=folder / "store",
@@ -173,12 +188,20 @@ def build(size: int, block: int | None, scheduler: str | None) -> None:
                 progress=progress,
                 scheduler=scheduler,
             )
-            seconds = time.perf_counter() - start
         progress("end", 1, 1)
         # What was published is read-only, to the folder's own removal too.
         for part in [result.path, *result.path.rglob("*")]:
             part.chmod(0o755)
-    print(json.dumps({"seconds": seconds, "steps": steps, **memory.gigabytes}))
+    seconds, processor = (sum(spent) for spent in zip(*steps.values(), strict=True))
+    took = {"seconds": seconds, "processor_s": processor, "steps": steps}
+    return took | memory.gigabytes
+
+
+def processor_s() -> float:
+    """Seconds of a processor that this process and its children have had."""
+    me = psutil.Process()
+    times = [process.cpu_times() for process in [me, *me.children(recursive=True)]]
+    return sum(spent.user + spent.system for spent in times)
 
 
 class Watch:
@@ -199,7 +222,7 @@ class Watch:
 
     def _look(self) -> None:
         me = psutil.Process()
-        while not self._over.wait(0.2):
+        while not self._over.wait(0.5):
             try:
                 own = me.memory_full_info().uss / 1e9
                 others = [c.memory_full_info().uss / 1e9 for c in me.children(recursive=True)]
@@ -216,6 +239,9 @@ def main() -> None:
         build(*json.loads(sys.argv[2]))
         return
     parts = {"compare": compare, "sizes": sizes, "workers": workers}
+    if sys.argv[1:2] == ["sizes"]:
+        sizes(*map(int, sys.argv[2:]))
+        return
     for name in sys.argv[1:] or parts:
         parts[name]()
 
