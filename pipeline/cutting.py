@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from magtiles.catalog.releases.lattice import Lattice
+from magtiles.pipeline import receipts
 from magtiles.pipeline.artifacts import open_artifact
 from magtiles.pipeline.preview import write_preview
 from magtiles.pipeline.progress import Progress
@@ -69,5 +71,22 @@ def _cut_one(inputs: Mapping[str, Any], out: Path, params: Mapping[str, Any]) ->
 
 
 def _draw(level: Path, picture: Path, product: str, version: str) -> None:
+    made_from = _identity(level, product, version)
+    if receipts.why_stale(picture, made_from) is None:
+        return
     with open_artifact(level) as opened:
         write_preview(opened, picture, product, version)
+    receipts.write_receipt(picture, made_from, "none")
+
+
+def _identity(level: Path, product: str, version: str) -> dict[str, Any]:
+    """Everything that decides what a preview shows."""
+    drawing = {"matplotlib": importlib.metadata.version("matplotlib")}
+    return {
+        "stage": "preview",
+        "version": 1,
+        "params": {"product": product, "version": version},
+        "inputs": {"level": [{"name": level.name, "sha256": receipts.digest(level)}]},
+        "packages": receipts.package_versions() | drawing,
+        "code": receipts.code_digest("magtiles.pipeline"),
+    }

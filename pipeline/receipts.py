@@ -129,10 +129,13 @@ def package_versions() -> dict[str, str]:
 
 
 @functools.cache
-def code_digest() -> str:
-    """The sha256 over our modules and schemas that decide what an artifact holds."""
+def code_digest(*more: str) -> str:
+    """The sha256 over our modules and schemas that decide what an artifact holds.
+
+    `more` names further packages that do.
+    """
     total = hashlib.sha256()
-    for package in _CODE:
+    for package in (*_CODE, *more):
         for name, file in sorted(_code_files(resources.files(package), package)):
             total.update(f"{name}\0".encode() + hashlib.sha256(file.read_bytes()).digest())
     return total.hexdigest()
