@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from magtiles.pipeline import receipts
-from magtiles.pipeline.fetching import cache_folder
+from magtiles.pipeline.fetching import cache_folder, catalog_sources
 from magtiles.schemas.errors import SourceError
 from magtiles.stages.ingest.source import Source
 
@@ -30,13 +30,13 @@ def find_source(name: str, product: Path, key: str) -> Path:
             expected=f"a file at {found}",
             remedy="correct the path",
         )
-    entry = _CATALOG / f"{name}.toml"
-    if entry.is_file():
-        return entry
+    known = catalog_sources()
+    if name in known:
+        return known[name]
     raise SourceError(
         f"the catalog has no source '{name}'",
         where=f"{product} {key}",
-        expected="the path of a source TOML, or an id in the catalog",
+        expected=f"the path of a source TOML, or an id of the catalog: {', '.join(known)}",
         remedy="write the path with its .toml",
     )
 

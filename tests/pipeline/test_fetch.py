@@ -20,6 +20,7 @@ import pytest
 
 from magtiles.pipeline.fetching import cache_folder, catalog_sources
 from magtiles.pipeline.main import main
+from magtiles.pipeline.source_paths import find_source
 from magtiles.stages.ingest.field_model import FIELD_MODEL
 from magtiles.stages.ingest.index import ACTIVITY_INDEX
 from magtiles.stages.ingest.observatory.stage import OBSERVATORY_SERIES
@@ -181,3 +182,9 @@ def test_what_no_program_can_fetch(capsys: pytest.CaptureFixture[str], tmp_path:
     assert "get NAmag_hp500.grd by hand from https://" in error
     assert main(["fetch", "nothing", "--to", str(tmp_path)]) == 1
     assert "the catalog has no source 'nothing'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", catalog_sources())
+def test_a_product_finds_every_source_by_its_id(name: str, tmp_path: Path) -> None:
+    """Whatever the source's file is called."""
+    assert find_source(name, tmp_path / "product.toml", "anomaly.source") == catalog_sources()[name]
