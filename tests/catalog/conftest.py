@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,16 @@ def folder(world: World, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def release(folder: Path) -> Release:
     return open_release(folder)
+
+
+@pytest.fixture
+def copy(folder: Path, tmp_path: Path) -> Path:
+    """A copy of the release that may be written to."""
+    target = tmp_path / "1.0.0"
+    shutil.copytree(folder, target, copy_function=shutil.copyfile)
+    for path in (target, *target.rglob("*")):
+        path.chmod(0o755)
+    return target
 
 
 def hills(lat: np.ndarray, lon: np.ndarray) -> np.ndarray:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,12 +11,11 @@ from typing import Any, NamedTuple
 import netCDF4
 import numpy as np
 import pytest
+from tampering import reseal
 
 from magtiles.catalog import Release, open_release
 from magtiles.catalog.releases.digest import (
     array_digest,
-    canonical_json,
-    manifest_digest,
     sha256,
 )
 from magtiles.catalog.releases.fields import Fields, parse_json
@@ -25,24 +23,6 @@ from magtiles.schemas.errors import IntegrityError
 
 TILE = "tiles/r001c001.nc"
 POSITION = (44.2, 10.3, 500.0)  # in that tile
-
-
-@pytest.fixture
-def copy(folder: Path, tmp_path: Path) -> Path:
-    """A copy of the release that may be written to."""
-    target = tmp_path / "1.0.0"
-    shutil.copytree(folder, target, copy_function=shutil.copyfile)
-    for path in (target, *target.rglob("*")):
-        path.chmod(0o755)
-    return target
-
-
-def rewrite(folder: Path, change: Callable[[dict[str, Any]], Any]) -> None:
-    """Edit the manifest and seal it again, as someone with bad intent would."""
-    document = json.loads((folder / "manifest.json").read_bytes())
-    change(document)
-    document["manifest_digest"] = manifest_digest(document)
-    (folder / "manifest.json").write_bytes(canonical_json(document))
 
 
 def replace_tile(folder: Path, edit: Callable[[Any], Any]) -> None:
@@ -57,7 +37,7 @@ def replace_tile(folder: Path, edit: Callable[[Any], Any]) -> None:
         record = next(f for f in document["files"] if f["path"] == TILE)
         record |= {"size": len(data), "sha256": sha256(data)}
 
-    rewrite(folder, relist)
+    reseal(folder, relist)
 
 
 def flip_bit(folder: Path) -> None:
@@ -172,7 +152,7 @@ LIES = [
 
 @pytest.mark.parametrize("case", LIES, ids=lambda c: c.message)
 def test_a_manifest_is_not_trusted(copy: Path, case: Lie) -> None:
-    rewrite(copy, case.change)
+    reseal(copy, case.change)
     with pytest.raises(IntegrityError, match=case.message) as caught:
         open_release(copy)
     assert "manifest.json" in str(caught.value)
@@ -218,7 +198,7 @@ def test_a_tile_of_another_format_is_refused(copy: Path) -> None:
         record = next(f for f in document["files"] if f["path"] == TILE)
         record |= {"size": len(junk), "sha256": sha256(junk)}
 
-    rewrite(copy, relist)
+    reseal(copy, relist)
     with pytest.raises(IntegrityError, match="is no readable tile"):
         open_release(copy).anomaly.total(*POSITION)
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,9 +13,10 @@ import pytest
 import xarray as xr
 from road_maps import Road, road_map
 from synthetic_release import World
+from tampering import flipped_bits, flipped_bytes, reseal
 
 from magtiles.catalog import open_release
-from magtiles.catalog.releases.digest import canonical_json, manifest_digest, sha256
+from magtiles.catalog.releases.digest import sha256
 from magtiles.catalog.releases.road_file import read_road
 from magtiles.catalog.releases.road_table import ALWAYS, FEATURES, NANOSECONDS, ROAD_VARIABLES
 from magtiles.schemas import contracts
@@ -44,24 +43,6 @@ def folder(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return World(heights=(0.0, 1000.0)).publish(store, extra_files={PATH: whole}).path
 
 
-@pytest.fixture
-def copy(folder: Path, tmp_path: Path) -> Path:
-    """A copy of the release that may be written to."""
-    target = tmp_path / "1.0.0"
-    shutil.copytree(folder, target, copy_function=shutil.copyfile)
-    for path in (target, *target.rglob("*")):
-        path.chmod(0o755)
-    return target
-
-
-def reseal(folder: Path, change: Callable[[dict[str, Any]], Any]) -> None:
-    """Edit the manifest and seal it again, as someone with bad intent would."""
-    document = json.loads((folder / "manifest.json").read_bytes())
-    change(document)
-    document["manifest_digest"] = manifest_digest(document)
-    (folder / "manifest.json").write_bytes(canonical_json(document))
-
-
 def record(document: dict[str, Any]) -> dict[str, Any]:
     found: dict[str, Any] = next(f for f in document["files"] if f["role"] == "road")
     return found
@@ -71,9 +52,7 @@ def test_no_flipped_bit_is_accepted(copy: Path) -> None:
     path = copy / PATH
     data = path.read_bytes()
     accepted = 0
-    for position in np.random.default_rng(5).integers(0, 8 * len(data), 200).tolist():
-        flipped = bytearray(data)
-        flipped[position // 8] ^= 1 << position % 8
+    for flipped in flipped_bits(data, 200):
         path.write_bytes(flipped)
         with contextlib.suppress(IntegrityError):
             _ = open_release(copy).roads["loop"]
@@ -87,11 +66,9 @@ def test_damaged_bytes_that_the_manifest_lists_are_an_error_or_whole(whole: Path
     """Whatever a forged digest lets through is parsed or refused, never a crash."""
     data = whole.read_bytes()
     refused = 0
-    for position in np.random.default_rng(8).integers(0, len(data), 200).tolist():
-        flipped = bytearray(data)
-        flipped[position] ^= 0xFF
+    for flipped in flipped_bytes(data, 200, len(data)):
         try:
-            read_road(bytes(flipped), "loop.nc")
+            read_road(flipped, "loop.nc")
         except IntegrityError:
             refused += 1
     assert refused > 50

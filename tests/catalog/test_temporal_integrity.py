@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,10 +12,11 @@ import numpy as np
 import ppigrf
 import pytest
 from synthetic_release import World
+from tampering import flipped_bits, flipped_bytes, reseal
 from temporal import temporal_dataset
 
 from magtiles.catalog import open_release
-from magtiles.catalog.releases.digest import canonical_json, manifest_digest, sha256
+from magtiles.catalog.releases.digest import sha256
 from magtiles.catalog.releases.temporal_file import read_temporal
 from magtiles.catalog.releases.temporal_table import (
     ALWAYS,
@@ -48,24 +47,6 @@ def folder(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return small.publish(tmp_path_factory.mktemp("store"), extra_files=extra).path
 
 
-@pytest.fixture
-def copy(folder: Path, tmp_path: Path) -> Path:
-    """A copy of the release that may be written to."""
-    target = tmp_path / "1.0.0"
-    shutil.copytree(folder, target, copy_function=shutil.copyfile)
-    for path in (target, *target.rglob("*")):
-        path.chmod(0o755)
-    return target
-
-
-def reseal(folder: Path, change: Callable[[dict[str, Any]], Any]) -> None:
-    """Edit the manifest and seal it again, as someone with bad intent would."""
-    document = json.loads((folder / "manifest.json").read_bytes())
-    change(document)
-    document["manifest_digest"] = manifest_digest(document)
-    (folder / "manifest.json").write_bytes(canonical_json(document))
-
-
 def record(document: dict[str, Any]) -> dict[str, Any]:
     found: dict[str, Any] = next(f for f in document["files"] if f["role"] == "temporal")
     return found
@@ -75,9 +56,7 @@ def test_no_flipped_bit_is_accepted(copy: Path) -> None:
     path = copy / "temporal.nc"
     data = path.read_bytes()
     accepted = 0
-    for position in np.random.default_rng(5).integers(0, 8 * len(data), 200).tolist():
-        flipped = bytearray(data)
-        flipped[position // 8] ^= 1 << position % 8
+    for flipped in flipped_bits(data, 200):
         path.write_bytes(flipped)
         with contextlib.suppress(IntegrityError):
             _ = open_release(copy).temporal
@@ -90,13 +69,10 @@ def test_no_flipped_bit_is_accepted(copy: Path) -> None:
 def test_damaged_bytes_that_the_manifest_lists_are_an_error_or_whole(whole: Path) -> None:
     """Whatever a forged digest lets through is parsed or refused, never a crash."""
     data = whole.read_bytes()
-    rng = np.random.default_rng(8)
     refused = 0
-    for position in rng.integers(0, 40_000, 150).tolist():  # the structure comes first
-        flipped = bytearray(data)
-        flipped[position] ^= 0xFF
+    for flipped in flipped_bytes(data, 150, 40_000):  # the structure comes first
         try:
-            read_temporal(bytes(flipped), "temporal.nc")
+            read_temporal(flipped, "temporal.nc")
         except IntegrityError:
             refused += 1
     assert refused > 50  # measured: 101 of 150; the rest is padding and long names
