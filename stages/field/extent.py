@@ -17,14 +17,15 @@ def data_bounds(grid: xr.Dataset) -> tuple[float, float, float, float]:
     """
     rows, columns = axes(grid)
     # Along each row its first and last datum suffice: the outline of what there is.
-    x, y = [], []
+    first, last, used = [], [], []
     for start, end in strips(grid["magnetic_anomaly"].shape):
         data = np.isfinite(rows_of(grid, start, end)["magnetic_anomaly"].values)
-        used = np.flatnonzero(data.any(axis=1))
-        first, behind = data[used].argmax(axis=1), data[used, ::-1].argmax(axis=1)
-        x += [columns[first], columns[columns.size - 1 - behind]]
-        y += [rows[start + used]] * 2
-    lon, lat = choose_plane(grid).source.transform(np.concatenate(x), np.concatenate(y))
+        some = np.flatnonzero(data.any(axis=1))
+        first.append(columns[data[some].argmax(axis=1)])
+        last.append(columns[::-1][data[some, ::-1].argmax(axis=1)])
+        used.append(rows[start + some])
+    x, y = np.concatenate([*first, *last]), np.concatenate([*used, *used])
+    lon, lat = choose_plane(grid).source.transform(x, y)
     middle = float(lon[lon.size // 2])
     unwrapped = middle + (np.asarray(lon) - middle + 180.0) % 360.0 - 180.0
     west = (float(unwrapped.min()) + 180.0) % 360.0 - 180.0
