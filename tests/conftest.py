@@ -1,4 +1,4 @@
-"""Shared fixtures: where the real data lie, when they do."""
+"""What all tests share: where the real data lie, when they do, and no test against the clock."""
 
 from __future__ import annotations
 
@@ -6,6 +6,11 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
+
+# A busy machine is no failure.
+settings.register_profile("unhurried", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("unhurried")
 
 _DEFAULT = Path(__file__).resolve().parents[2] / "shared" / "data"
 

@@ -17,7 +17,8 @@ METHODS = ("total", "total_with_gradient", "vector", "vector_with_gradient", "te
 BOUNDS = {"latitude": (44.05, 44.4), "longitude": (10.1, 10.62)}
 
 RELAXED = settings(
-    max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=20,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 
 

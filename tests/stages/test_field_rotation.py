@@ -20,7 +20,7 @@ def matrices(five):
     return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(PRODUCTS, ANGLES, PLUNGES, ANGLES, st.floats(-1.5, 1.5), st.floats(-3, 3))
 def test_rotation(given_products, turn, plunge, azimuth, plunge_0, azimuth_0):
     """V' = R V, G' = R G R^T, T' = T + (R^T f - f0) . V; norms and the trace are kept."""
