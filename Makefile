@@ -33,11 +33,14 @@ tiles: $(RELEASES) ## Build and validate PRODUCT="a.toml b.toml" (default: the d
 	  '  $(MAGTILES) query RELEASE --lat LAT --lon LON --height METRES' \
 	  'README.md shows how a filter loads one and how to build your own survey.'
 
-# Each product is built, then validated, by itself, so that `make -j` may run several at once.
+# Each product is built, then validated, by itself, so that `make -j` may run several at once; what
+# is said of one comes in one piece.
 $(RELEASES): release/%: % $(READY)
 	@echo '$(MAGTILES) build $* --store $(STORE), and validate'
 	@built=$$($(MAGTILES) build $* --store $(STORE) --json) && \
-	  $(MAGTILES) validate "$$(printf '%s' "$$built" | $(PATH_OF))"
+	  release=$$(printf '%s' "$$built" | $(PATH_OF)) && \
+	  { checks=$$($(MAGTILES) validate "$$release"); status=$$?; \
+	  printf '%s\n' "$$release" "$$checks"; exit $$status; }
 
 build/sample/demo.toml build/sample/world.toml: pipeline/sample.py pipeline/sample_model.py \
   pipeline/synthetic_observatories.py pipeline/sample_drives.py pipeline/sample_vehicles.py $(READY)
