@@ -75,10 +75,11 @@ def resolved_degree(grid: xr.Dataset) -> int:
 def derive_globe_components(globe: xr.Dataset, *, params: SphereComponentsParams) -> xr.Dataset:
     """Nine products of a survey of the globe, `height_m` higher, with uncertainty and flags.
 
-    Input anomaly-grid/1 (latitude, longitude) around the globe, voids and all; output
-    component-grid/1 on (latitude, longitude): nT, nT/km, NED. The total is f . B, f the ambient
-    direction at the level. VOID_FILLED stands near nodes without data, as far as the height gained
-    and at least a cell; BEYOND_COVERAGE poleward of the last parallel with data.
+    Input anomaly-grid/1 (latitude, longitude) around the globe, voids and all, its coordinates
+    taken for WGS84's (datums differ by less than a kilometre); output component-grid/1 on
+    (latitude, longitude): nT, nT/km, NED. The total is f . B, f the ambient direction at the
+    level. VOID_FILLED stands near nodes without data, as far as the height gained and at least a
+    cell; BEYOND_COVERAGE poleward of the last parallel with data.
 
     Raises ContractError for a grid that does not go around or whose heights count from terrain,
     CoverageError for one too fine, without data, or a level below the survey without permission.

@@ -50,7 +50,8 @@ _LOWEST_CRUST = 16
 _WIDTH = 0.05
 """Below it the power of a degree is a mean over so much of the degrees around it, at least one."""
 
-_LEAST_POWER = 1e-6
+_LEAST_POWER = 1e-6, 1e-9
+"""Of the power of a degree: as a part of the highest, and nT^2."""
 _TOLERANCES = 1e-3, 1e-6
 """Relative residuals of random sets, and of the data's own."""
 
@@ -269,7 +270,7 @@ def _likely_power(found: Real, gamma: Real) -> Real:
         return np.asarray(sums[last] - sums[first])
 
     power = around(found) / np.maximum(around(gamma), 0.02 * around(np.asarray(2.0 * n + 1.0)))
-    power = np.maximum(power, _LEAST_POWER * power.max())
+    power = np.maximum(power, _LEAST_POWER[0] * power.max() + _LEAST_POWER[1])
     crust = n >= _LOWEST_CRUST
     if np.count_nonzero(crust) > 2:
         weight = np.sqrt(np.maximum(gamma, 1e-3 * (2 * n + 1))[crust])

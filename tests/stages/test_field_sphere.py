@@ -198,3 +198,10 @@ def test_a_pole_of_the_grid_is_left_out() -> None:
     values[[0, -1]] = -99_722.0
     smeared = level(as_grid(latitude, longitude, values, 0.5), HEIGHT_M, STEP)
     xr.testing.assert_identical(smeared, without)
+
+
+def test_a_flat_anomaly_gives_a_flat_map() -> None:
+    globe = world(random_crust(20, seed=13), STEP, 0.5)
+    made = level(globe.assign(magnetic_anomaly=globe.magnetic_anomaly * 0.0), HEIGHT_M, STEP)
+    assert np.abs(made.magnetic_anomaly.values).max() == 0.0
+    assert made.magnetic_anomaly_uncertainty.values.min() > 0.0
