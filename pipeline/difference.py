@@ -13,7 +13,7 @@ from scipy import ndimage
 from magtiles.catalog import Release, open_release
 from magtiles.catalog.flags import QualityFlag
 from magtiles.catalog.releases import versions
-from magtiles.catalog.releases.lattice import Lattice
+from magtiles.catalog.releases.lattice import HALO, Lattice
 from magtiles.pipeline.plotting import QUANTITIES, preview_figure
 from magtiles.pipeline.preview import assemble_level, figure_note, figure_title
 from magtiles.schemas.errors import UsageError
@@ -176,8 +176,9 @@ class _Level:
     def __init__(self, before: Release, after: Release, height: float) -> None:
         self.height = height
         self.lattice = before.manifest.lattice
-        self.old = _arrays(before, height)
-        self._new = _arrays(after, height)
+        self.old = _cores(_arrays(before, height))
+        self._wide = _arrays(after, height)
+        self._new = _cores(self._wide)
         self._y, self._x, inside = _places(self.lattice, after.manifest.lattice)
         self.same_nodes = _on_nodes(self._y[inside]) and _on_nodes(self._x[inside])
         self._node = _nearest(self._y, self._x, inside)
@@ -191,11 +192,13 @@ class _Level:
 
     def change(self, variable: str) -> NDArray[np.float64]:
         """New minus old of a variable, (rows, columns); meaningless where not `both`."""
-        old, new = self.old[variable].astype(np.float64), self._new[variable]
+        old = self.old[variable].astype(np.float64)
         if self.same_nodes:
-            return np.asarray(new[self._node] - old, np.float64)
+            return np.asarray(self._new[variable][self._node] - old, np.float64)
+        # The halo keeps the spline's ends away, as it does for the reader.
+        place = (self._y + HALO, self._x + HALO)
         smooth = ndimage.map_coordinates(
-            new.astype(np.float64), (self._y, self._x), order=3, mode="nearest"
+            self._wide[variable].astype(np.float64), place, order=3, mode="nearest"
         )
         return np.asarray(smooth - old, np.float64)
 
@@ -250,8 +253,12 @@ def _arrays(release: Release, height: float) -> dict[str, NDArray[Any]]:
     for kind in QUANTITIES.values():
         names += [name for name in (kind.variable, kind.uncertainty) if name not in names]
     level = release.manifest.heights_m.index(height)
-    arrays = assemble_level(release.tiles(), release.manifest.lattice, level, names)
+    arrays = assemble_level(release.tiles(), release.manifest.lattice, level, names, halo=HALO)
     return dict(zip(names, arrays, strict=True))
+
+
+def _cores(arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    return {name: array[HALO:-HALO, HALO:-HALO] for name, array in arrays.items()}
 
 
 def _places(

@@ -78,19 +78,36 @@ def write_preview(level: xr.Dataset, path: Path, product: str, version: str) -> 
 
 
 def assemble_level(
-    tiles: Iterable[TileData], lattice: Lattice, level: int, names: Sequence[str]
+    tiles: Iterable[TileData],
+    lattice: Lattice,
+    level: int,
+    names: Sequence[str],
+    *,
+    halo: int = 0,
 ) -> list[NDArray[Any]]:
-    """Variables at one level on all core nodes, (rows + 1, columns + 1) each."""
+    """Variables at one level on all core nodes and `halo` more on each side.
+
+    (rows + 1 + 2 halo, columns + 1 + 2 halo) each; there are `HALO` such nodes.
+    """
     whole: list[NDArray[Any]] = []
     for tile in tiles:
-        cores = [tile.variables[name][level, HALO:-HALO, HALO:-HALO] for name in names]
+        # Of the halo only what lies outside the map: inside it, nodes are some tile's own.
+        rows, i = _own(tile.record.row, lattice.shape[0], lattice.tile_rows, halo)
+        columns, j = _own(tile.record.column, lattice.shape[1], lattice.tile_columns, halo)
+        parts = [tile.variables[name][level, rows, columns] for name in names]
         if not whole:
-            shape = (lattice.rows + 1, lattice.columns + 1)
-            whole = [np.empty(shape, core.dtype) for core in cores]
-        i, j = tile.record.row * lattice.tile_rows, tile.record.column * lattice.tile_columns
-        for array, core in zip(whole, cores, strict=True):
-            array[i : i + core.shape[0], j : j + core.shape[1]] = core
+            shape = (lattice.rows + 1 + 2 * halo, lattice.columns + 1 + 2 * halo)
+            whole = [np.empty(shape, part.dtype) for part in parts]
+        for array, part in zip(whole, parts, strict=True):
+            array[i : i + part.shape[0], j : j + part.shape[1]] = part
     return whole
+
+
+def _own(place: int, tiles: int, cells: int, halo: int) -> tuple[slice, int]:
+    """Which nodes of a tile's axis to take, and where they begin on the map with its halo."""
+    first = HALO - halo if place == 0 else HALO
+    last = halo - HALO if place == tiles - 1 else -HALO
+    return slice(first, last or None), place * cells + halo + first - HALO
 
 
 def figure_title(

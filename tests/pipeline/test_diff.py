@@ -104,7 +104,7 @@ def test_coverage_beyond_the_old_lattice_is_gained(
 
 
 def test_another_lattice_is_interpolated(exact_release: Path, finer_release: Path) -> None:
-    """The same field on both: what is left is the interpolation's error, 0.3 % of the rms."""
+    """The same field on both: what is left is the interpolation's error, 0.01 % of the rms."""
     found = compare_releases(exact_release, finer_release)
     assert found.interpolated
     assert found.bump == "major"
@@ -112,7 +112,9 @@ def test_another_lattice_is_interpolated(exact_release: Path, finer_release: Pat
     assert lowest["total"].nodes > 1000
     rms = np.sqrt(np.mean([t.statistics["magnetic_anomaly"]["rms"][0] ** 2
                            for t in read_manifest(exact_release).tiles.values()]))  # fmt: skip
-    assert lowest["total"].rms < 0.003 * rms
+    # Measured 0.00010 and 0.0014; 0.0012 and 0.014, at the border, where the halo was not used.
+    assert lowest["total"].rms < 0.0003 * rms
+    assert abs(lowest["total"].largest) < 0.004 * rms
 
 
 def test_the_command(
