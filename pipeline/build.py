@@ -21,7 +21,8 @@ from magtiles.pipeline.survey_map import plan_survey_map
 from magtiles.pipeline.tasks import SCRATCH, Workplace, working
 from magtiles.pipeline.temporal_part import build_temporal
 from magtiles.schemas.errors import CoverageError, MagtilesError, ParameterError, SourceError
-from magtiles.stages.release.atomic import remove_temporaries
+from magtiles.stages.ingest.unpack import scratch
+from magtiles.stages.release.atomic import remove_temporaries, writing
 from magtiles.stages.release.lock import locked
 from magtiles.stages.release.provenance import resource, slsa_predicate
 from magtiles.stages.release.publish import PublishResult, publish_release
@@ -67,14 +68,27 @@ def _alone_in(folder: Path) -> Iterator[None]:
     """One build at a time in a folder, without what those leave that die."""
     with locked(folder, _LOCK_NAME, doing="building"):
         _sweep(folder)
-        yield
+        with _unpacking_in(folder / SCRATCH):
+            yield
         _sweep(folder)
         for blocks in folder.glob("*.blocks"):  # of a build that was killed when it had them all
             shutil.rmtree(blocks, ignore_errors=True)
 
 
+@contextlib.contextmanager
+def _unpacking_in(folder: Path) -> Iterator[None]:
+    with writing(folder):
+        folder.mkdir(exist_ok=True)
+    before = scratch.set(folder)
+    try:
+        yield
+    finally:
+        scratch.reset(before)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
 def _sweep(folder: Path) -> None:
-    """Remove temporary files, of this build's dead workers too, and a dead cluster's own."""
+    """Remove temporary files of builds that died, and of this one's workers."""
     for inner, _, _ in os.walk(folder):
         remove_temporaries(Path(inner))
     shutil.rmtree(folder / SCRATCH, ignore_errors=True)

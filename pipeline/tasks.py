@@ -29,8 +29,8 @@ _STARTS = 3
 _WORKERLESS_S = 300
 """How long a local cluster may be without workers: one that dies as it comes is not replaced."""
 _WORKERS_DIE = "check memory; a script that builds must do so below if __name__ == '__main__':"
-SCRATCH = ".cluster"
-"""Name of the folder of a local cluster's own files, in the build's folder."""
+SCRATCH = ".scratch"
+"""Name of the folder of a local cluster's own files, and of unpacked ones, in the build's."""
 
 
 @dataclass

@@ -10,6 +10,7 @@ import tempfile
 import zipfile
 import zlib
 from collections.abc import Iterator
+from contextvars import ContextVar
 from pathlib import Path, PurePosixPath
 from typing import Protocol
 
@@ -19,6 +20,10 @@ from magtiles.schemas.errors import FormatError, SourceError
 class _Readable(Protocol):
     def read(self, size: int, /) -> bytes: ...
 
+
+scratch: ContextVar[Path | None] = ContextVar("scratch", default=None)
+"""Where to unpack; default where the system keeps temporary files. A build names a folder of its
+own, so that the next one removes what one that was killed left there."""
 
 _LIMIT_BYTES = 16 << 30
 _BLOCK_BYTES = 1 << 20
@@ -42,7 +47,7 @@ def unpacked(path: Path, member: str | None = None) -> Iterator[Path]:
     if kind is None:
         yield path
         return
-    with tempfile.TemporaryDirectory(prefix="magtiles-") as name:
+    with tempfile.TemporaryDirectory(prefix="magtiles-", dir=scratch.get()) as name:
         yield _unpack(kind, path, Path(name), member)
 
 

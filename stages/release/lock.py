@@ -27,14 +27,15 @@ def locked(folder: Path, name: str, *, doing: str) -> Iterator[None]:
     try:
         yield
     finally:
-        path.unlink(missing_ok=True)  # while it is held: nobody else can have made it anew
+        with contextlib.suppress(OSError):
+            path.unlink()  # while it is held: nobody else can have made it anew
         os.close(descriptor)
 
 
 def _lock(path: Path, doing: str) -> int:
     """A descriptor of the file at `path`, locked."""
     while True:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
         try:
             _wait(descriptor, path, doing)
             if _is_at(path, descriptor):

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import functools
+import gzip
 import hashlib
 import importlib
 import os
@@ -42,8 +43,15 @@ _FREE = resource.RLIM_INFINITY
 
 
 def write_product(folder: Path, *, in_blocks: bool) -> Path:
-    """A product of two levels and several tiles; in blocks, which asks for a cluster, or whole."""
-    product = write_survey(folder, synthesize(SPEC))[-1]
+    """A product of two levels and several tiles; in blocks, which asks for a cluster, or whole.
+
+    Its survey is packed.
+    """
+    survey, source, product = write_survey(folder, synthesize(SPEC))
+    packed = survey.with_name(f"{survey.name}.gz")
+    packed.write_bytes(gzip.compress(survey.read_bytes(), mtime=0))
+    survey.unlink()
+    source.write_text(source.read_text().replace(survey.name, packed.name))
     blocks = "block_nodes = 128\n" if in_blocks else ""
     product.write_text(f"{product.read_text()}tile_deg = 0.25\n{blocks}")
     return product
