@@ -124,7 +124,7 @@ class AnomalyTable(Params):
         default=None,
         ge=128,
         doc="Make levels in blocks of so many nodes a side; default blocks of 1024 where the "
-        "survey has more than 4096 x 4096 nodes, or a level twice that.",
+        "survey has more than 3072 x 3072 nodes, or a level twice that.",
     )
 
 

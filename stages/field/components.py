@@ -55,7 +55,7 @@ class DeriveComponentsParams(Params):
         default=None,
         ge=128,
         doc="Transform in blocks of so many nodes a side; default blocks of 1024 where the grid "
-        "has more than 4096 x 4096 nodes, or the output twice that.",
+        "has more than 3072 x 3072 nodes, or the output twice that.",
     )
 
 

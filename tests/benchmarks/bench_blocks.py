@@ -3,10 +3,11 @@
 ``bench_blocks.py`` does all; name parts of it (``compare``, ``sizes``, ``workers``) to do those.
 A map of 3000 x 3000 nodes, with a void and a coast, is made at once and in blocks, and compared
 everywhere. Builds of 1024 to 8192 nodes a side, five levels each, run in processes of their
-own, with two workers; each has built a small map before, so that starting and importing do not
-count. What they cost is in seconds of a processor, user's and system's, workers included: the same
-whatever else the machine does. What they hold in memory is what no other process shares with
-them. Name sizes after ``sizes`` to do only those.
+own, with two workers. What they cost is in seconds of a processor, user's and system's, workers
+included: much the same whatever else the machine does. A build of a small map, just before, tells
+what does not grow with the map (its second: the first imports and starts), and is taken off. What
+they hold in memory is what no other process shares with them. Name sizes after ``sizes`` to do
+only those.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ LOW = {"inclination_deg": 8.0, "declination_deg": 37.0}
 SIZES = (1024, 2048, 4096, 8192)
 LEVELS_M = (800.0, 1300.0, 2300.0, 4300.0)
 WORKERS_SIZE, WORKERS_BLOCK = 3000, 1024
-WARM_SIZE, WARM_BLOCK = 400, 200
+SMALL = 256
 
 
 def example() -> xr.Dataset:
@@ -119,10 +120,12 @@ def sizes(*wanted: int) -> None:
     first = None
     for size in wanted or SIZES:
         made = in_process(size, None, 2)
-        spent, cell = made["processor_s"], made["processor_s"] / size**2
+        spent, fixed = made["processor_s"], made["fixed_s"]
+        cell = (spent - fixed) / (size**2 - SMALL**2)
         first = first or cell
         print(
-            f"  {size:5} a side: {spent:7.1f} s of a processor in {made['seconds']:7.1f} s, "
+            f"  {size:5} a side: {spent:7.1f} s of a processor ({fixed:.1f} s for {SMALL} a side) "
+            f"in {made['seconds']:.1f} s, "
             f"{1e6 * cell:6.2f} us a cell ({cell / first:.2f} of the first; asked: 0.8 to 1.2), "
             f"at most {made['whole_gb']:.2f} GB, {made['own_gb']:.2f} in the build's own process "
             f"and {made['worker_gb']:.2f} in a worker (asked at 4096: below 4)",
@@ -157,8 +160,9 @@ def build(size: int, block: int | None, count: int) -> None:
             n_workers=count, threads_per_worker=1, dashboard_address="127.0.0.1:0", memory_limit=0
         ) as cluster,
     ):
-        built(WARM_SIZE, WARM_BLOCK, cluster.scheduler_address)
-        print(json.dumps(built(size, block, cluster.scheduler_address)))
+        address = cluster.scheduler_address
+        fixed = [built(SMALL, None, address)["processor_s"] for _ in range(2)][1]
+        print(json.dumps(built(size, block, address) | {"fixed_s": fixed}))
 
 
 def built(size: int, block: int | None, scheduler: str) -> dict[str, Any]:
