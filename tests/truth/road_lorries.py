@@ -171,7 +171,7 @@ def main() -> None:
     """Print how many points and lorries are dropped."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 10, 20])
-    parser.add_argument("--trials", type=int, default=18)
+    parser.add_argument("--trials", type=int, default=9)
     options = parser.parse_args()
     roads = []
     for seed in options.seeds:
