@@ -128,6 +128,30 @@ def test_an_input_that_disappears_makes_its_release_stale(product, built, tmp_pa
     assert not (tmp_path / "store").exists()
 
 
+SOURCE = '[source]\nid = "more"\nfiles = ["gone.dat"]\nlicence = "none"\nkind = '
+MORE = {
+    "surface": ('"surface-grid"', 'surface = "more.toml"'),
+    "observatory": (
+        '"observatory-series"',
+        '[temporal]\nobservatories = ["more.toml"]\nmonths = ["2020-01"]',
+    ),
+    "log": ('"track"', '[[roads]]\nname = "road"\nlogs = {car = ["more.toml"]}'),
+}
+
+
+@pytest.mark.parametrize(("kind", "asked"), MORE.values(), ids=MORE)
+def test_files_of_every_kind_of_source_are_missed_before_the_work(product, tmp_path, kind, asked):
+    copied = Path(shutil.copytree(product.parent, tmp_path / "in"))
+    (copied / "more.toml").write_text(f"{SOURCE}{kind}\n")
+    for file in (copied / "small.toml", copied / "small-survey.toml"):
+        text = file.read_text()
+        file.write_text(text.replace('"ellipsoid"', '"terrain"') if "surface" in kind else text)
+    (copied / "small.toml").write_text(f"{(copied / 'small.toml').read_text()}{asked}\n")
+    with pytest.raises(SourceError, match=r"more\.toml: .* of 'more' is missing: no file .*gone"):
+        build_product(copied / "small.toml", store=tmp_path / "store", work=tmp_path / "work")
+    assert files(tmp_path) == {"in", *(f"in/{name}" for name in files(copied))}
+
+
 def test_nothing_is_written_when_nothing_changed(product, built):
     def state() -> dict[str, tuple[int, int]]:
         stats = {str(p): p.stat() for p in built.rglob("*") if p.is_file()}
