@@ -45,7 +45,7 @@ from magtiles.stages.field.uncertainty import (
     lost_power,
     noise_gain_of,
 )
-from magtiles.stages.field.windows import MapWindows, Reflection, spans
+from magtiles.stages.field.windows import MapWindows, Reflection, Span, spans
 
 Real = NDArray[np.float64]
 Direction = tuple[float, float, float]
@@ -55,7 +55,8 @@ NINE = ("total", *VECTOR, *TENSOR)
 LONG_CELLS, SHORT_CELLS = 80.0, 36.0
 """From which wavelength on, in cells, all is long, and up to which nothing is."""
 _THIN_CELLS, _DENSITY = 8.0, 2
-_STRIP = 512
+_STRIP, _PATCHES = 512, 4
+"""Rows that are read at a time, and how many patches as wide as that beside each other."""
 _NOISE_NODES, _WIDE_CELLS = 1025, 16.0
 
 
@@ -151,19 +152,30 @@ def _pass(windows: MapWindows, padding: Padding) -> _Pass:
     power, patches = np.zeros((patch[0], patch[1] // 2 + 1)), 0
     squares = noise = 0.0
     measured = np.zeros(3)
-    for (first, last), strip in windows.strips(_STRIP):
-        part = slice(first, last)
-        centred = strip.values - windows.mean
-        coarse += down[:, part] @ (across @ centred.T).T
-        for total, values in zip(thin, (strip.values, strip.void, strip.beyond), strict=True):
-            total += rows_of[:, part] @ (columns_of @ values.T.astype(float)).T
-        squares += float((centred**2).sum())
-        noise += float(np.mean(strip.sigma**2)) * centred.size
-        known = centred[~(strip.void | strip.beyond)]
-        measured += known.size, known.sum(), (known**2).sum()
-        for found in _powers(centred, shape[1], patch):
-            power += found
-            patches += 1
+    pieces = [
+        (columns, starts, across[:, slice(*columns)], columns_of[:, slice(*columns)])
+        for columns, starts in _pieces(shape[1])
+    ]
+    for rows in spans(shape[0], _STRIP):
+        part, count = slice(*rows), rows[1] - rows[0]
+        narrow = np.zeros((counts[1], count))
+        means = np.zeros((3, columns_of.shape[0], count))
+        for columns, starts, across_here, columns_here in pieces:
+            piece = windows.read(rows, columns)
+            centred = piece.values - windows.mean
+            narrow += across_here @ centred.T
+            for total, values in zip(means, (piece.values, piece.void, piece.beyond), strict=True):
+                total += columns_here @ values.T.astype(float)
+            squares += float((centred**2).sum())
+            noise += float(np.mean(piece.sigma**2)) * centred.size
+            known = centred[~(piece.void | piece.beyond)]
+            measured += known.size, known.sum(), (known**2).sum()
+            for found in _powers(centred, starts, patch):
+                power += found
+                patches += 1
+        coarse += down[:, part] @ narrow.T
+        for total, thinned in zip(thin, means, strict=True):
+            total += rows_of[:, part] @ thinned.T
     mean = measured[1] / measured[0]
     return _Pass(
         coarse,
@@ -256,10 +268,17 @@ def _patch_shape(shape: tuple[int, int]) -> tuple[int, int]:
     return first, second
 
 
-def _powers(strip: Real, columns: int, patch: tuple[int, int]) -> Iterator[Real]:
-    """Spectral power of a strip's patches under a Hann window, per node."""
+def _pieces(columns: int) -> list[tuple[Span, list[int]]]:
+    """Spans of columns that are read at a time, and where the patches in each of them start."""
+    found = spans(columns, _STRIP)
+    groups = [found[i : i + _PATCHES] for i in range(0, len(found), _PATCHES)]
+    return [((g[0][0], g[-1][1]), [first - g[0][0] for first, _ in g]) for g in groups]
+
+
+def _powers(piece: Real, starts: list[int], patch: tuple[int, int]) -> Iterator[Real]:
+    """Spectral power of a piece's patches under a Hann window, per node."""
     window = np.multiply.outer(*(np.hanning(n + 2)[1:-1] for n in patch))
-    for first, _ in spans(columns, _STRIP):
-        part = strip[: patch[0], first : first + patch[1]]
+    for first in starts:
+        part = piece[: patch[0], first : first + patch[1]]
         centred = (part - np.average(part, weights=window)) * window
         yield np.abs(forward(centred)) ** 2 / (window**2).sum()

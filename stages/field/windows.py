@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -168,11 +167,6 @@ class MapWindows:
             beyond=inner.beyond[pick] | outside,
             sigma=inner.sigma[pick] if inner.sigma.ndim else inner.sigma,
         )
-
-    def strips(self, nodes: int) -> Iterator[tuple[Span, PlaneMap]]:
-        """The whole map, in strips of at most so many rows."""
-        for rows in spans(self.shape[0], nodes):
-            yield rows, self.read(rows, (0, self.shape[1]))
 
     def _resampled(self, y: Real, x: Real) -> PlaneMap:
         """A window of the plane from the grid's nodes around it, as `prepare` resamples a map."""
