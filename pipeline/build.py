@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -54,6 +55,7 @@ def build_product(
 
     Raises MagtilesError subclasses for bad sources, data, parameters and versions.
     """
+    _refuse_workers(product)
     wanted = load_product(product)
     folder = work / wanted.product.name
     for written in (store / wanted.product.name, folder):
@@ -61,6 +63,18 @@ def build_product(
     _check_inputs(wanted, store, data)
     with _asked_by(product), _alone_in(folder):
         return _build(wanted, store, folder, data, progress, scheduler)
+
+
+def _refuse_workers(product: Path) -> None:
+    """A worker that starts runs the script that builds: it would wait for its own parent."""
+    starting = sys.modules.get("__mp_main__")
+    if starting is not None and sys.modules["__main__"] is not starting:
+        raise MagtilesError(
+            "a worker of this very build was about to build it",
+            where=product,
+            expected="a script that a worker can import",
+            remedy="put what builds below if __name__ == '__main__':",
+        )
 
 
 @contextlib.contextmanager
