@@ -31,8 +31,8 @@ LARGEST = 3072 * 3072
 
 At once, a map of 2048 x 2048 took 1.3 GB, in blocks 0.6 GB; the one grows with the map.
 """
-BLOCK_NODES = 1024
-"""Of a block a side: with larger ones margins weigh less, but arrays leave the caches."""
+BLOCK_NODES = 2048
+"""Of a block a side. Half of it takes a seventh longer for the margins, and 0.2 GB less."""
 _METRES_PER_DEGREE = 111_195.0
 _STRIP = 512
 """Rows of a level that are put together at a time."""
