@@ -45,12 +45,17 @@ def identity(stage: Stage, params: Params, inputs: Mapping[str, Sequence[Path]])
     }
 
 
-def write_receipt(artifact: Path, made_from: Mapping[str, Any], contract: str) -> None:
-    """Write the receipt of a finished artifact that has been checked against `contract`."""
+def write_receipt(
+    artifact: Path, made_from: Mapping[str, Any], contract: str, *, passing: bool = False
+) -> None:
+    """Write the receipt of a finished artifact that has been checked against `contract`.
+
+    What is `passing`, and nothing else is made from by name, is known by its size and time alone.
+    """
     stat = artifact.stat()
     output = {
         "contract": contract,
-        "sha256": _sha256(artifact),
+        "sha256": "" if passing else _sha256(artifact),
         "size": stat.st_size,
         "mtime_ns": stat.st_mtime_ns,
     }

@@ -18,11 +18,11 @@ import xarray as xr
 from magtiles.catalog.releases.lattice import Lattice
 from magtiles.pipeline.artifacts import open_artifact
 from magtiles.pipeline.harmonic_lattice import GLOBE, check_halo, harmonic_spacing
-from magtiles.pipeline.large_levels import LevelJob, LevelTasks, begin
+from magtiles.pipeline.large_levels import LevelJob, begin
 from magtiles.pipeline.product import AnomalyTable, SurveyMap
 from magtiles.pipeline.source_paths import data_files, manifest_inputs
 from magtiles.pipeline.steps import MapPlan, Steps, node_axes
-from magtiles.pipeline.tasks import Tasks
+from magtiles.pipeline.tasks import Task, Tasks
 from magtiles.schemas.errors import CoverageError, ParameterError
 from magtiles.stages.field import components, crop, sphere, voids
 from magtiles.stages.field.extent import data_bounds
@@ -189,7 +189,7 @@ class Levels:
     ) -> None:
         self._wanted, self._survey, self._lattice = wanted, survey, lattice
         self._folder, self._steps = folder, steps
-        self._begun: dict[float, LevelTasks] = {}
+        self._begun: dict[float, list[Task[None]]] = {}
         self._tasks = Tasks()
 
     @property
@@ -200,7 +200,8 @@ class Levels:
     def begin(self, tasks: Tasks, heights: Sequence[float]) -> None:
         """Ask for the blocks of all levels, lowest first: none waits while one is put together."""
         self._tasks = tasks
-        self._begun = {height: begin(tasks, self._job(height)) for height in heights}
+        begun = begin(tasks, [self._job(height) for height in heights])
+        self._begun = dict(zip(heights, begun, strict=True))
 
     def make(self, height: float) -> Path:
         """The level of one height."""
@@ -216,7 +217,7 @@ class Levels:
         self._steps.report(components.STAGE.name)
         begun = self._begun.pop(height)
         tell = self._steps.within(f"blocks of {job.out.stem}")
-        self._tasks.results(begun.tasks, lambda done: tell(done, len(begun.tasks)))
+        self._tasks.results(begun, lambda done: tell(done, len(begun)))
         return job.out
 
     def _job(self, height: float) -> LevelJob:

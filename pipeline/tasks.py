@@ -63,6 +63,13 @@ class Tasks:
         """Whether there is a cluster."""
         return self._starting is not None
 
+    @property
+    def workers(self) -> int:
+        """How many tasks are done side by side, as far as is known now."""
+        if self._starting is None:
+            return 1
+        return len(self._starting.result().scheduler_info(n_workers=-1)["workers"]) or 1
+
     def submit(
         self, function: Callable[..., Value], *arguments: Any, after: Sequence[Task[Any]] = ()
     ) -> Task[Value]:

@@ -21,6 +21,13 @@ _OVERSAMPLING = 2
 
 def evaluate_products(field: AnomalousField, nodes: Nodes, height_gain: float) -> Single:
     """The nine products (9, m, n) in NED at the nodes, in the order of `PRODUCTS`."""
+    out = evaluate_on_plane(field, nodes, height_gain)
+    rotate_to_ned(out, nodes.north, nodes.ambient, np.array(field.inversion.direction))
+    return out
+
+
+def evaluate_on_plane(field: AnomalousField, nodes: Nodes, height_gain: float) -> Single:
+    """The nine products (9, m, n) along the plane's axes, the total along the mean direction."""
     out = np.empty((len(PRODUCTS), *nodes.row.shape), np.float32)
     w, offset = field.wavenumbers, field.padding.offset
     dense = w.shape[0] * _OVERSAMPLING
@@ -29,10 +36,10 @@ def evaluate_products(field: AnomalousField, nodes: Nodes, height_gain: float) -
     rows = slice(first, last)
     shift = np.array([offset[0] * _OVERSAMPLING - rows.start, offset[1] * _OVERSAMPLING], float)
     level = field.level(height_gain, _OVERSAMPLING)
+    coefficients: Single | None = None
     for product, values in zip(("total", *VECTOR, *TENSOR), out, strict=True):
-        coefficients = level.values(product, rows, slice(None))
+        coefficients = level.values(product, rows, slice(None), coefficients)
         evaluate_spline(coefficients, nodes.row, nodes.column, float(_OVERSAMPLING), shift, values)
-    rotate_to_ned(out, nodes.north, nodes.ambient, np.array(field.inversion.direction))
     return out
 
 

@@ -16,11 +16,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from magtiles.stages.field.at_nodes import evaluate_products, quality_flags
+from magtiles.stages.field.at_nodes import evaluate_on_plane, quality_flags
 from magtiles.stages.field.decimation import spline_matrix
 from magtiles.stages.field.direction import AmbientSource
-from magtiles.stages.field.interpolate import evaluate_spline
-from magtiles.stages.field.level import PRODUCTS
+from magtiles.stages.field.interpolate import add_splines
 from magtiles.stages.field.padding import Padding, plan_padding
 from magtiles.stages.field.plane import STEP_M, coarse_axis
 from magtiles.stages.field.prepare import PlaneMap
@@ -34,6 +33,7 @@ from magtiles.stages.field.solve import (
 )
 from magtiles.stages.field.spectral import (
     LOW_INCLINATION_SINE,
+    VECTOR,
     Inversion,
     Wavenumbers,
     odd_fast_length,
@@ -92,32 +92,59 @@ class BlockSolution:
     flags: NDArray[np.uint8]
 
 
-def solve_block(
-    windows: MapWindows, whole: xr.Dataset, ambient: AmbientSource, nodes: Nodes, height_gain: float
-) -> BlockSolution:
-    """A block's part of a level, at `nodes` of the map, `height_gain` m above it.
+class MapBlock:
+    """A block of a map: its field, continued to one level after another.
 
-    `whole` is what `survey_whole` gave for that height.
+    `nodes` are those of every level. What levels have in common is done once where they follow
+    one another.
     """
-    padding = plan_padding(windows.shape, windows.spacing, height_gain)
-    inner = [
-        _within(index, n, o)
-        for index, n, o in zip(
-            (nodes.row, nodes.column), padding.shape, padding.offset, strict=True
-        )
-    ]
-    short = _short_field(windows, whole, ambient, padding, inner)
-    products = evaluate_products(short, nodes, height_gain)
-    products += _long_products(whole, padding, nodes)
+
+    def __init__(self, windows: MapWindows, ambient: AmbientSource, nodes: Nodes) -> None:
+        self._windows, self._ambient, self._nodes = windows, ambient, nodes
+        self._solved: tuple[Padding, AnomalousField] | None = None
+
+    def solve(self, height_gain: float, whole: xr.Dataset) -> BlockSolution:
+        """Its part of a level `height_gain` m above the map, which `survey_whole` gave `whole`."""
+        windows, nodes = self._windows, self._nodes
+        padding = plan_padding(windows.shape, windows.spacing, height_gain)
+        inner = [
+            _within(index, n, o)
+            for index, n, o in zip(
+                (nodes.row, nodes.column), padding.shape, padding.offset, strict=True
+            )
+        ]
+        field = self._short_field(whole, padding, inner)
+        products = evaluate_on_plane(field, nodes, height_gain)
+        direction = np.array(field.inversion.direction)
+        _add_long_products(products, whole, padding, nodes, direction)
+        rotate_to_ned(products, nodes.north, nodes.ambient, direction)
+        around, placed = _around(windows, padding, inner, nodes, height_gain)
+        survey = survey_variance(around, placed.row, placed.column)
+        sigmas = budget_of(whole).sigma(survey, nodes.row, nodes.column)
+        return BlockSolution(products, sigmas, quality_flags(around, placed, height_gain))
+
+    def _short_field(
+        self, whole: xr.Dataset, padding: Padding, inner: Sequence[Span]
+    ) -> AnomalousField:
+        """The same for all levels with the same padding."""
+        if self._solved is None or self._solved[0] != padding:
+            self._solved = None  # that two are never in memory
+            self._solved = (
+                padding,
+                _short_field(self._windows, whole, self._ambient, padding, inner),
+            )
+        return self._solved[1]
+
+
+def _around(
+    windows: MapWindows, padding: Padding, inner: Sequence[Span], nodes: Nodes, height_gain: float
+) -> tuple[PlaneMap, Nodes]:
+    """The map as far around nodes as its gaps reach up to a level, and where nodes lie in it."""
     rows, columns = (
         _grown(span, abs(height_gain), d) for span, d in zip(inner, windows.spacing, strict=True)
     )
-    around = windows.extended(rows, columns, padding)
     row, column = nodes.row - rows[0], nodes.column - columns[0]
-    placed = Nodes(row, column, nodes.north, nodes.ambient)
-    survey = survey_variance(around, row, column)
-    sigmas = budget_of(whole).sigma(survey, nodes.row, nodes.column)
-    return BlockSolution(products, sigmas, quality_flags(around, placed, height_gain))
+    return windows.extended(rows, columns, padding), Nodes(row, column, nodes.north, nodes.ambient)
 
 
 def _within(index: Real, size: int, offset: int) -> Span:
@@ -205,35 +232,38 @@ def _directions(windows: MapWindows, around: PlaneMap, ambient: AmbientSource) -
 def _long_map(whole: xr.Dataset, padding: Padding, rows: Span, columns: Span) -> Real:
     """The long wavelengths of the mapped anomaly (nT) at the nodes of a window."""
     places = [np.arange(*span, dtype=float) for span in (rows, columns)]
-    coefficients, (row, column) = _coefficients(whole["long_map"], padding, places)
+    part, (row, column) = _coefficients_around(whole, padding, places)
+    coefficients = whole["long_map"][part].values
     down, across = (
         spline_matrix(at, n) for at, n in zip((row, column), coefficients.shape, strict=True)
     )
     return np.asarray((across @ (down @ coefficients).T).T)
 
 
-def _long_products(whole: xr.Dataset, padding: Padding, nodes: Nodes) -> Single:
-    """The long wavelengths' nine products (9, m, n) in NED at nodes of the map."""
-    out = np.empty((len(PRODUCTS), *nodes.row.shape), np.float32)
-    for name, values in zip(NINE, out, strict=True):
-        places = [nodes.row, nodes.column]
-        coefficients, (row, column) = _coefficients(whole[f"long_{name}"], padding, places)
-        evaluate_spline(coefficients, row, column, 1.0, np.zeros(2), values)
-    rotate_to_ned(out, nodes.north, nodes.ambient, np.array(whole.attrs["direction"]))
-    return out
+def _add_long_products(
+    products: Single, whole: xr.Dataset, padding: Padding, nodes: Nodes, direction: Real
+) -> None:
+    """Add those of the long wavelengths to products (9, m, n) along the plane's axes.
+
+    The total is that along `direction` (y, x, d).
+    """
+    part, (row, column) = _coefficients_around(whole, padding, [nodes.row, nodes.column])
+    long = {name: whole[f"long_{name}"][part].values for name in NINE}
+    for axis, turn in zip(VECTOR, direction - whole.attrs["direction"], strict=True):
+        long["total"] = long["total"] + np.float32(turn) * long[axis]
+    add_splines(np.stack(list(long.values()), axis=-1), row, column, products)
 
 
-def _coefficients(
-    variable: xr.DataArray, padding: Padding, places: Sequence[Real]
-) -> tuple[Single, list[Real]]:
-    """The coefficients around places of the map, and those places among them."""
+def _coefficients_around(
+    whole: xr.Dataset, padding: Padding, places: Sequence[Real]
+) -> tuple[tuple[slice, ...], list[Real]]:
+    """Which coefficients of the long wavelengths are around places of the map, and those there."""
     parts, found = [], []
-    for at, count, size, offset in zip(
-        places, variable.shape, padding.shape, padding.offset, strict=True
-    ):
+    counts = (whole.sizes[name] for name in ("long_row", "long_column"))
+    for at, count, size, offset in zip(places, counts, padding.shape, padding.offset, strict=True):
         scaled = (at + offset) * (count / size)
         first, last = int(np.floor(scaled.min())) - 1, int(np.floor(scaled.max())) + 3
         whole_axis = first < 0 or last > count
         parts.append(slice(None) if whole_axis else slice(first, last))
         found.append(scaled if whole_axis else scaled - first)
-    return np.ascontiguousarray(variable[tuple(parts)].values), found
+    return tuple(parts), found

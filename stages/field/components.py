@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable
+
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
@@ -11,7 +14,8 @@ from magtiles.stages.declare import Params, Stage, quantity
 from magtiles.stages.field.at_nodes import evaluate_products, quality_flags
 from magtiles.stages.field.blocks import Block
 from magtiles.stages.field.direction import Ambient, AmbientSource
-from magtiles.stages.field.large import LargeLevel, is_large, strips
+from magtiles.stages.field.laid import lay_on_plane
+from magtiles.stages.field.large import LargeMap, is_large, strips
 from magtiles.stages.field.level import OF_DATUM, assemble_level, mean_angles, wgs84_variable
 from magtiles.stages.field.padding import plan_padding
 from magtiles.stages.field.prepare import prepare
@@ -106,37 +110,54 @@ def makes_blocks(grid: xr.Dataset, params: DeriveComponentsParams) -> bool:
     return is_large((shape[0], shape[1]), (target[0], target[1]))
 
 
-def large_level(
-    grid: xr.Dataset, params: DeriveComponentsParams, known: tuple[float, float] | None = None
-) -> LargeLevel:
-    """The blocks of a level; where mean and sigma of the map are `known`, it is not read for them.
+def large_map(
+    grid: xr.Dataset,
+    params: DeriveComponentsParams,
+    known: tuple[float, float] | None = None,
+    laid: xr.Dataset | None = None,
+) -> LargeMap:
+    """A grid in blocks; where mean and sigma of the map are `known`, it is not read for them.
 
-    Raises as `derive_components`.
+    `laid` is the map on its plane (`lay_on_plane`), unless it lies on that by itself. The height
+    of `params` is only checked. Raises as `derive_components`.
     """
     _permit(grid, params)
-    windows = MapWindows.of(grid, known)
+    windows = MapWindows.of(grid, known, laid)
     ambient = AmbientSource(grid, params.inclination_deg, params.declination_deg)
     if params.latitude is not None and params.longitude is not None:
         target = geographic_target(params.latitude, params.longitude)
     else:
         target = own_target(grid, windows.plane)
-    return LargeLevel.plan(windows, ambient, target, params.height_m, params.block_nodes)
+    return LargeMap.plan(windows, ambient, target, params.block_nodes)
 
 
-def derive_block(level: LargeLevel, whole: xr.Dataset, block: Block) -> xr.Dataset:
-    """A block of a level, overlaps included: component-grid/1 on its nodes."""
-    target, nodes, found = level.solve(whole, block)
-    parts = found.products, found.sigmas, found.flags
-    return _assemble(level.windows.grid, target, nodes, level.height_gain, *parts)
+def block_maker(large: LargeMap, block: Block) -> Callable[[float, xr.Dataset], xr.Dataset]:
+    """What makes a block of a level, overlaps included: component-grid/1 on its nodes.
+
+    From the level's height gain (m) and what `LargeMap.survey` found for it.
+    """
+    grid = large.windows.grid
+    target, nodes, part = large.part(block)
+
+    def make(height_gain: float, whole: xr.Dataset) -> xr.Dataset:
+        found = part.solve(height_gain, whole)
+        parts = found.products, found.sigmas, found.flags
+        return _assemble(grid, target, nodes, height_gain, *parts)
+
+    return make
 
 
 def _blended(grid: xr.Dataset, params: DeriveComponentsParams) -> xr.Dataset:
     """A level of blocks, in memory."""
-    level = large_level(grid, params)
-    known = level.survey()
-    made = {block: derive_block(level, known, block) for row in level.blocks for block in row}
-    first = made[level.blocks[0][0]]
-    dims, axes = level.target.dims, (level.target.rows, level.target.columns)
+    large = large_map(grid, params)
+    if not large.windows.plane.is_source:
+        laid = xr.concat(lay_on_plane(large.windows), "y", data_vars="minimal")
+        large = large_map(grid, params, laid=laid)
+    level = params.height_m, large.survey(params.height_m)
+    blocks = itertools.chain.from_iterable(large.blocks)
+    made = {block: block_maker(large, block)(*level) for block in blocks}
+    first = made[large.blocks[0][0]]
+    dims, axes = large.target.dims, (large.target.rows, large.target.columns)
     coordinates = {
         name: (name, axis, first[name].attrs) for name, axis in zip(dims, axes, strict=True)
     }
@@ -144,7 +165,7 @@ def _blended(grid: xr.Dataset, params: DeriveComponentsParams) -> xr.Dataset:
     for name, variable in first.data_vars.items():
         if variable.ndim:
             values = {block: part[name].values for block, part in made.items()}
-            whole = strips(level.blocks, str(name), lambda b, *part, of=values: of[b][part])
+            whole = strips(large.blocks, str(name), lambda b, *part, of=values: of[b][part])
             out[name] = dims, np.concatenate([strip for _, strip in whole]), variable.attrs
         else:
             out[name] = variable

@@ -9,6 +9,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 Real = NDArray[np.float64]
+Single = NDArray[np.float32]
 Floats = NDArray[np.floating[Any]]
 
 
@@ -51,6 +52,33 @@ def evaluate_spline(
                     + b[3] * line[c0 + 2]
                 )
             out[i, j] = total
+
+
+@njit(parallel=True, cache=True, nogil=True)
+def add_splines(coefficients: Single, row: Real, column: Real, out: Single) -> None:
+    """Add to each of `out` (k, m, n) its cubic B-spline's values at (row, column).
+
+    `coefficients` (rows, columns, k): those of all splines side by side, so that their sums are
+    vectors. Positions beyond them are moved as by `evaluate_spline`.
+    """
+    last_row, last_column = coefficients.shape[0] - 2, coefficients.shape[1] - 2
+    for i in prange(out.shape[1]):
+        total = np.empty(coefficients.shape[2], np.float32)
+        for j in range(out.shape[2]):
+            r = min(max(row[i, j], 1.0), last_row - 1e-9)
+            c = min(max(column[i, j], 1.0), last_column - 1e-9)
+            r0, c0 = int(r), int(c)
+            a = _weights(r - r0)
+            b = _weights(c - c0)
+            total[:] = 0.0
+            for m in range(4):
+                for n in range(4):
+                    weight = np.float32(a[m] * b[n])
+                    here = coefficients[r0 - 1 + m, c0 - 1 + n]
+                    for k in range(total.size):
+                        total[k] += weight * here[k]
+            for k in range(total.size):
+                out[k, i, j] += total[k]
 
 
 @njit(parallel=True, cache=True, nogil=True)

@@ -1,4 +1,4 @@
-"""One level of a map that is too large for one transform, or for memory, block by block."""
+"""Levels of a map that is too large for one transform, or for memory, block by block."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from magtiles.stages.field.blocks import (
     OVERLAP_CELLS,
     Block,
-    BlockSolution,
+    MapBlock,
     plan_blocks,
-    solve_block,
 )
 from magtiles.stages.field.direction import AmbientSource
 from magtiles.stages.field.level import PRODUCTS
@@ -31,7 +30,7 @@ LARGEST = 3072 * 3072
 
 At once, a map of 2048 x 2048 took 1.3 GB, in blocks 0.6 GB; the one grows with the map.
 """
-BLOCK_NODES = 2048
+BLOCK_NODES = 2560
 """Of a block a side. Half of it takes a seventh longer for the margins, and 0.2 GB less."""
 _METRES_PER_DEGREE = 111_195.0
 _STRIP = 512
@@ -44,21 +43,19 @@ def is_large(shape: tuple[int, int], target: tuple[int, int]) -> bool:
 
 
 @dataclass(frozen=True)
-class LargeLevel:
-    """A level to be made block by block.
+class LargeMap:
+    """A map whose levels are made block by block.
 
     Attributes
     ----------
     windows, ambient : the map and its ambient direction.
-    target : the nodes of the level.
-    height_gain : of the level above the map, m.
+    target : the nodes of every level.
     blocks : rows of blocks.
     """
 
     windows: MapWindows
     ambient: AmbientSource
     target: Target
-    height_gain: float
     blocks: list[list[Block]]
 
     @classmethod
@@ -67,9 +64,8 @@ class LargeLevel:
         windows: MapWindows,
         ambient: AmbientSource,
         target: Target,
-        height_gain: float,
         block_nodes: int | None,
-    ) -> LargeLevel:
+    ) -> LargeMap:
         """Blocks of at most `block_nodes` nodes of the map a side, and of the target as well."""
         wide = block_nodes or BLOCK_NODES
         ratio = [max(windows.spacing) / d for d in _spacing(target)]
@@ -79,17 +75,17 @@ class LargeLevel:
         )
         shape = target.rows.size, target.columns.size
         blocks = plan_blocks(shape, tuple(most), tuple(overlap))
-        return cls(windows, ambient, target, height_gain, blocks)
+        return cls(windows, ambient, target, blocks)
 
-    def survey(self) -> xr.Dataset:
-        """What every block needs to know of the whole map."""
-        return survey_whole(self.windows, self.ambient, self.height_gain)
+    def survey(self, height_gain: float) -> xr.Dataset:
+        """What every block of a level needs to know of the whole map."""
+        return survey_whole(self.windows, self.ambient, height_gain)
 
-    def solve(self, whole: xr.Dataset, block: Block) -> tuple[Target, Nodes, BlockSolution]:
-        """A block's nodes, overlaps included, and what the level is there."""
+    def part(self, block: Block) -> tuple[Target, Nodes, MapBlock]:
+        """The nodes of a block, overlaps included, and the map there."""
         part = self.target.part(block.outer_rows, block.outer_columns)
         nodes = locate(part, self.windows, self.ambient)
-        return part, nodes, solve_block(self.windows, whole, self.ambient, nodes, self.height_gain)
+        return part, nodes, MapBlock(self.windows, self.ambient, nodes)
 
 
 def strips(
@@ -129,10 +125,12 @@ def _part(
             (rows, columns), (block.outer_rows, block.outer_columns), strict=True
         )
     )
-    values = read(block, down, across)
-    if name in PRODUCTS:
-        weights = _ramp(block.rows, block.outer_rows)[down], _ramp(block.columns, columns)
-        values = (values * np.multiply.outer(*weights)).astype(values.dtype)
+    if name not in PRODUCTS:
+        return read(block, down, across), columns
+    values = np.array(read(block, down, across))
+    below, beside = _ramp(block.rows, block.outer_rows)[down], _ramp(block.columns, columns)
+    values[below < 1.0] *= below[below < 1.0, None]
+    values[:, beside < 1.0] *= beside[beside < 1.0]
     return values, columns
 
 

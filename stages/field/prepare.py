@@ -61,18 +61,25 @@ class PlaneMap:
 
     def distance(self, gaps: Mask, outside: bool) -> Real:
         """True distance (m) of each node to the nearest of `gaps` (or the array's outside)."""
-        if not gaps.any():
-            return self._distance_to_outside() if outside else np.full(gaps.shape, np.inf)
         ringed = np.pad(gaps, 1, constant_values=outside)
-        found = ndimage.distance_transform_edt(~ringed, sampling=self.spacing)
+        rows, columns = ringed.all(axis=1), ringed.all(axis=0)
+        if np.array_equal(np.logical_or.outer(rows, columns), ringed):
+            # Whole rows and columns: the nearest node of those is straight ahead.
+            down, across = (
+                _to_nearest(np.asarray(lines)) * d
+                for lines, d in zip((rows, columns), self.spacing, strict=True)
+            )
+            found = np.minimum.outer(down, across)
+        else:
+            found = ndimage.distance_transform_edt(~ringed, sampling=self.spacing)
         return np.asarray(found[1:-1, 1:-1])
 
-    def _distance_to_outside(self) -> Real:
-        """The same where the nearest gap is the array's outside, from its border one node on."""
-        rows, columns = (
-            np.minimum(np.arange(n), np.arange(n)[::-1]) + 1.0 for n in self.values.shape
-        )
-        return np.minimum.outer(rows * self.spacing[0], columns * self.spacing[1])
+
+def _to_nearest(chosen: Mask) -> Real:
+    """How many places each is from the nearest that is chosen; infinity where none is."""
+    if not chosen.any():
+        return np.full(chosen.size, np.inf)
+    return np.asarray(ndimage.distance_transform_edt(~chosen))
 
 
 def prepare(grid: xr.Dataset) -> PlaneMap:

@@ -46,11 +46,17 @@ class Level:
     noise_to_signal: float = 0.0
     density: int = 1
 
-    def values(self, product: str, rows: slice, columns: slice) -> Single:
-        """A product on `rows` and `columns` of the padded, `density` times denser, lattice."""
+    def values(
+        self, product: str, rows: slice, columns: slice, out: Single | None = None
+    ) -> Single:
+        """A product on `rows` and `columns` of the padded, `density` times denser, lattice.
+
+        In `out` where one of their shape is given.
+        """
         shape = self.inversion.wavenumbers.shape
         dense = shape[0] * self.density, shape[1] * self.density
-        return np.asarray(inverse(self.spectrum(product), dense, rows, columns), np.float32)
+        spectrum = self.spectrum(product)
+        return np.asarray(inverse(spectrum, dense, rows, columns, out), np.float32)
 
     def spectrum(self, product: str) -> SingleComplex:
         """Spectrum of a product; only its rows are padded, the inverse pads its columns."""

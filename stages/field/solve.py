@@ -180,8 +180,9 @@ def _varying_part(
     """df.B (nT) on the padded plane."""
     out = np.zeros(inversion.wavenumbers.shape)
     surface = Level(total, inversion, 0.0)
+    values: Single | None = None
     for axis, part in zip(VECTOR, variation, strict=True):
-        values = surface.values(axis, slice(None), slice(None))
+        values = surface.values(axis, slice(None), slice(None), values)
         add_product(out, values, part, offset, shape)
     return out
 

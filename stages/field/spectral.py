@@ -35,6 +35,8 @@ _DAMPING = 0.1
 _PASS = 0.75
 
 _MANY = 1 << 18
+_STRIP = 1 << 20
+"""Numbers that are transformed at a time along rows: what stays near the processor."""
 
 
 def _workers(size: int) -> int:
@@ -166,15 +168,24 @@ def inverse(
     shape: tuple[int, int],
     rows: slice,
     columns: slice,
+    out: NDArray[np.floating[Any]] | None = None,
 ) -> NDArray[np.floating[Any]]:
     """The inverse transform, computed only for `rows`, returned for `columns`.
 
-    In the spectrum's own precision; overwrites it.
+    In the spectrum's own precision; overwrites it. Into `out` where one is given: a large array
+    that is new costs as much as half the transform, for the system clears it first.
     """
     workers = _workers(spectrum.size)
     partial = scipy.fft.ifft(spectrum, axis=0, overwrite_x=True, workers=workers)[rows]
-    values = scipy.fft.irfft(partial, n=shape[1], axis=1, workers=workers)
-    return np.asarray(values[:, columns])
+    if out is None:
+        width = len(range(*columns.indices(shape[1])))
+        out = np.empty((partial.shape[0], width), partial.real.dtype)
+    strip = max(1, _STRIP // shape[1])
+    for first in range(0, partial.shape[0], strip):
+        part = partial[first : first + strip]
+        values = scipy.fft.irfft(part, n=shape[1], axis=1, workers=workers)
+        out[first : first + strip] = values[:, columns]
+    return out
 
 
 def spline_prefilter(k: Real, spacing: float) -> Real:

@@ -86,6 +86,8 @@ class MapWindows:
     plane, y, x : as of `PlaneMap`.
     mean : of the grid's values, nT; beyond its border it is extended to that.
     sigma : what stands in for the survey's sigma where that is void, nT.
+    laid : what `lay_on_plane` made of the grid, if it did; else windows are resampled, each by
+        itself.
     """
 
     grid: xr.Dataset
@@ -94,9 +96,15 @@ class MapWindows:
     x: Real
     mean: float
     sigma: float
+    laid: xr.Dataset | None = None
 
     @classmethod
-    def of(cls, grid: xr.Dataset, known: tuple[float, float] | None = None) -> MapWindows:
+    def of(
+        cls,
+        grid: xr.Dataset,
+        known: tuple[float, float] | None = None,
+        laid: xr.Dataset | None = None,
+    ) -> MapWindows:
         """The windows of a grid; `mean` and `sigma` are read from it where they are not known.
 
         Raises ContractError for a grid with voids or without sigma, when it is read.
@@ -104,7 +112,7 @@ class MapWindows:
         plane = choose_plane(grid)
         y, x = axes(grid) if plane.is_source else plane_axes(grid, plane)
         mean, sigma = known or (_mean(grid), _median_sigma(grid))
-        return cls(grid, plane, y, x, mean, sigma)
+        return cls(grid, plane, y, x, mean, sigma, laid)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -132,8 +140,9 @@ class MapWindows:
     def read(self, rows: Span, columns: Span) -> PlaneMap:
         """A window within the map."""
         y, x = self.y[slice(*rows)], self.x[slice(*columns)]
-        if self.plane.is_source:
-            part = _part(self.grid, rows, columns)
+        source = self.grid if self.plane.is_source else self.laid
+        if source is not None:
+            part = _part(source, rows, columns)
             values = part["magnetic_anomaly"].values.astype(float)
             void, beyond = gaps_of(part)
             return PlaneMap(self.plane, y, x, values, void, beyond, sigma_of(part, self.sigma))

@@ -1,23 +1,27 @@
 """Maps of any size: blocks against one transform, memory and time by size, one worker and two.
 
-``bench_blocks.py`` does all; name parts of it (``compare``, ``sizes``, ``workers``) to do those.
+``bench_blocks.py`` does all; name parts of it (``compare``, ``sizes``, ``memory``, ``workers``)
+to do those.
 A map of 3000 x 3000 nodes, with a void and a coast, is made at once and in blocks, and compared
-everywhere. Builds of 1024 to 8192 nodes a side, five levels each, run in processes of their
-own, with two workers. What they cost is in seconds of a processor, user's and system's, workers
-included: much the same whatever else the machine does. A build of a small map, just before, tells
-what does not grow with the map (its second: the first imports and starts), and is taken off. What
-they hold in memory is what no other process shares with them. Name sizes after ``sizes`` to do
-only those.
+everywhere. Builds of 1024 to 8192 nodes a side, three levels each, run in processes of their
+own, with two workers; the smallest as the median of five. What they cost is in seconds of a
+processor, user's and system's, workers included. A build of a small map, just before, tells
+what does not grow with the map (its second: the first imports and starts), and is taken off. The
+rest is told by node of the source and by node of the release, which has more of them the farther
+the map reaches to the north and south. What a build of 4096, five levels, holds in memory is what
+no other process shares with its own. Name sizes after ``sizes`` to do only those.
 """
 
 from __future__ import annotations
 
 import json
+import statistics
 import subprocess
 import sys
 import tempfile
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +34,7 @@ import pyproj
 import scipy.fft
 import xarray as xr
 
+from magtiles.pipeline.artifacts import open_artifact
 from magtiles.pipeline.build import build_product
 from magtiles.stages.field.components import DeriveComponentsParams, derive_components
 from magtiles.stages.field.level import PRODUCTS, SIGMAS
@@ -39,7 +44,8 @@ COMPARED, SPACING_M = 3000, 250.0
 GAINS_M = (0.0, 500.0, 2000.0)
 LOW = {"inclination_deg": 8.0, "declination_deg": 37.0}
 SIZES = (1024, 2048, 4096, 8192)
-LEVELS_M = (800.0, 1300.0, 2300.0, 4300.0)
+COST_LEVELS_M = (800.0, 2300.0)
+MEMORY_SIZE, LEVELS_M = 4096, (800.0, 1300.0, 2300.0, 4300.0)
 WORKERS_SIZE, WORKERS_BLOCK = 3000, 1024
 SMALL = 256
 
@@ -115,28 +121,44 @@ def report(gain: float, one: xr.Dataset, blocked: xr.Dataset) -> None:
 
 
 def sizes(*wanted: int) -> None:
-    """Cost and memory of builds by size."""
-    print(f"builds of {1 + len(LEVELS_M)} levels, two workers")
-    first = None
+    """Cost of builds by size."""
+    print(f"builds of {1 + len(COST_LEVELS_M)} levels, two workers; microseconds of a processor")
+    firsts = None
     for size in wanted or SIZES:
-        made = in_process(size, None, 2)
-        spent, fixed = made["processor_s"], made["fixed_s"]
-        cell = (spent - fixed) / (size**2 - SMALL**2)
-        first = first or cell
+        runs = [in_process(size, None, 2, COST_LEVELS_M) for _ in range(5 if size < 2048 else 1)]
+        spent = [made["processor_s"] - made["fixed_s"] for made in runs]
+        made = runs[spent.index(statistics.median(spent))]
+        grown = statistics.median(spent)
+        costs = grown / made["nodes"], grown / (size**2 - SMALL**2)
+        firsts = firsts or costs
+        node, cell = (
+            f"{1e6 * cost:6.2f} ({cost / first:.2f} of the first)"
+            for cost, first in zip(costs, firsts, strict=True)
+        )
         print(
-            f"  {size:5} a side: {spent:7.1f} s of a processor ({fixed:.1f} s for {SMALL} a side) "
-            f"in {made['seconds']:.1f} s, "
-            f"{1e6 * cell:6.2f} us a cell ({cell / first:.2f} of the first; asked: 0.8 to 1.2), "
-            f"at most {made['whole_gb']:.2f} GB, {made['own_gb']:.2f} in the build's own process "
-            f"and {made['worker_gb']:.2f} in a worker (asked at 4096: below 4)",
+            f"  {size:5} a side: {node} a node of the release, {cell} of the source (asked: 0.8 "
+            f"to 1.2); {made['processor_s']:.1f} s, {made['fixed_s']:.1f} s of it for {SMALL} a "
+            f"side, in {made['seconds']:.1f} s; at most {made['whole_gb']:.2f} GB, "
+            f"{made['own_gb']:.2f} in the build's own process, {made['worker_gb']:.2f} in a worker",
             {step: [round(s, 1) for s in both] for step, both in made["steps"].items()},
+            [round(1e6 * s / made["nodes"], 2) for s in spent] if len(spent) > 1 else "",
             flush=True,
         )
 
 
+def memory() -> None:
+    """The most memory that a large build holds."""
+    made = in_process(MEMORY_SIZE, None, 2, LEVELS_M)
+    print(
+        f"{MEMORY_SIZE} a side, {1 + len(LEVELS_M)} levels: at most {made['whole_gb']:.2f} GB "
+        f"(asked: below 4), {made['own_gb']:.2f} in the build's own process, "
+        f"{made['worker_gb']:.2f} in a worker; {made['seconds']:.1f} s"
+    )
+
+
 def workers() -> None:
     """Time of one build in blocks by one worker, and by two."""
-    made = [in_process(WORKERS_SIZE, WORKERS_BLOCK, count) for count in (1, 2)]
+    made = [in_process(WORKERS_SIZE, WORKERS_BLOCK, count, LEVELS_M) for count in (1, 2)]
     for count, found in enumerate(made, 1):
         steps = {step: [round(s, 1) for s in both] for step, both in found["steps"].items()}
         print(f"  {count} workers: {found['seconds']:.1f} s, of it (and of a processor) {steps}")
@@ -144,15 +166,15 @@ def workers() -> None:
     print(f"two workers are {one / two:.2f} times as fast (asked: at least 1.6)")
 
 
-def in_process(size: int, block: int | None, count: int) -> dict[str, Any]:
+def in_process(size: int, block: int | None, count: int, levels: Sequence[float]) -> dict[str, Any]:
     """What `build` prints, in a process of its own."""
-    command = [sys.executable, __file__, "build", json.dumps([size, block, count])]
+    command = [sys.executable, __file__, "build", json.dumps([size, block, count, levels])]
     printed = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
     made: dict[str, Any] = json.loads(printed.splitlines()[-1])
     return made
 
 
-def build(size: int, block: int | None, count: int) -> None:
+def build(size: int, block: int | None, count: int, levels: Sequence[float]) -> None:
     """Build a map of that size with so many workers and print, as JSON, what it took."""
     with (
         dask.config.set({"distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": None}),
@@ -161,11 +183,13 @@ def build(size: int, block: int | None, count: int) -> None:
         ) as cluster,
     ):
         address = cluster.scheduler_address
-        fixed = [built(SMALL, None, address)["processor_s"] for _ in range(2)][1]
-        print(json.dumps(built(size, block, address) | {"fixed_s": fixed}))
+        small = [built(SMALL, None, address, levels) for _ in range(2)][1]
+        made = built(size, block, address, levels)
+        made["nodes"] -= small["nodes"]
+        print(json.dumps(made | {"fixed_s": small["processor_s"]}))
 
 
-def built(size: int, block: int | None, scheduler: str) -> dict[str, Any]:
+def built(size: int, block: int | None, scheduler: str, levels: Sequence[float]) -> dict[str, Any]:
     """What it took to build a map of that size."""
     bench_chain.SIZE = size
     steps: dict[str, list[float]] = {}
@@ -181,7 +205,7 @@ def built(size: int, block: int | None, scheduler: str) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         product = bench_chain.write_inputs(folder)
-        text = product.read_text().replace(str(list(bench_chain.LEVELS_M)), str(list(LEVELS_M)))
+        text = product.read_text().replace(str(list(bench_chain.LEVELS_M)), str(list(levels)))
         product.write_text(text + (f"block_nodes = {block}\n" if block else ""))
         with Watch() as memory:
             last[:] = time.perf_counter(), processor_s(), "start"
@@ -193,11 +217,13 @@ def built(size: int, block: int | None, scheduler: str) -> dict[str, Any]:
                 scheduler=scheduler,
             )
         progress("end", 1, 1)
+        with open_artifact(next(folder.glob("work/*/level-*.nc"))) as level:
+            nodes = level["magnetic_anomaly"].size
         # What was published is read-only, to the folder's own removal too.
         for part in [result.path, *result.path.rglob("*")]:
             part.chmod(0o755)
     seconds, processor = (sum(spent) for spent in zip(*steps.values(), strict=True))
-    took = {"seconds": seconds, "processor_s": processor, "steps": steps}
+    took = {"seconds": seconds, "processor_s": processor, "steps": steps, "nodes": nodes}
     return took | memory.gigabytes
 
 
@@ -242,7 +268,7 @@ def main() -> None:
     if sys.argv[1:2] == ["build"]:
         build(*json.loads(sys.argv[2]))
         return
-    parts = {"compare": compare, "sizes": sizes, "workers": workers}
+    parts = {"compare": compare, "sizes": sizes, "memory": memory, "workers": workers}
     if sys.argv[1:2] == ["sizes"]:
         sizes(*map(int, sys.argv[2:]))
         return

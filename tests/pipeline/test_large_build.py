@@ -102,7 +102,7 @@ def test_building_again_makes_nothing(products, built, monkeypatch):
         raise AssertionError
 
     monkeypatch.setattr(large_levels, "_make_level", never)
-    monkeypatch.setattr(large_levels, "_make_block", never)
+    monkeypatch.setattr(large_levels, "_make_blocks", never)
     result = build(built.parents[2], products["blocked"])
     assert result.path == built
     assert not result.changed
@@ -117,24 +117,24 @@ def jobs(products, folder: Path) -> LevelJob:
 
 def test_an_interrupted_level_goes_on_from_its_blocks(products, tmp_path):
     job, here = jobs(products, tmp_path), Tasks()
-    begun = large_levels.begin(here, job)
-    for task in begun.tasks[:3]:  # the whole map and two blocks
+    [begun] = large_levels.begin(here, [job])
+    for task in begun[:4]:  # the map on its plane, the whole of it and two blocks
         task.result()
     kept = {path.name: path.stat().st_mtime_ns for path in job.folder.glob("*.nc")}
     assert len(kept) == 3
     spoilt = job.block(0, 1)
     spoilt.write_bytes(spoilt.read_bytes()[:-100])
-    begun = large_levels.begin(here, job)
-    here.results(begun.tasks[:-1], lambda done: None)
+    [begun] = large_levels.begin(here, [job])
+    here.results(begun[:-1], lambda done: None)
     after = {path.name: path.stat().st_mtime_ns for path in job.folder.glob("*.nc")}
-    assert len(after) == len(begun.tasks) - 1 >= 5
+    assert len(after) == len(begun) - 2 >= 5
     assert {name for name in kept if after[name] != kept[name]} == {spoilt.name}
-    begun.tasks[-1].result()
+    begun[-1].result()
     assert not job.folder.exists()
-    assert receipts.why_stale(job.out, begun.made_from) is None
+    assert receipts.why_stale(job.out, job.made_from) is None
     # A build that was killed before the blocks had gone.
     job.folder.mkdir()
-    assert not large_levels.begin(here, job).tasks
+    assert not large_levels.begin(here, [job])[0]
     assert not job.folder.exists()
 
 
