@@ -16,6 +16,12 @@ from magtiles.stages.ingest.hdf5_checks import check_hdf5
 from magtiles.stages.release.atomic import atomic_path
 from magtiles.stages.release.tile_file import write_tile
 
+_CHUNK, _CHUNK_CACHE = (512, 256), 1 << 20
+"""Rows and columns of a chunk in files of which windows are read, and bytes kept of them.
+
+Of rows that are not in chunks, the library reads 64 kB each, however few are wanted.
+"""
+
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 
@@ -76,6 +82,21 @@ def _add_strips(dataset: xr.Dataset, path: Path) -> None:
             for rows in (variable.chunks or ((),))[0]:
                 made[first : first + rows] = variable[first : first + rows].values
                 first += rows
+
+
+def create_variable(file: Any, name: str, like: xr.Variable) -> Any:
+    """A variable of a netCDF4.Dataset, to be written in strips of whole chunks: all of it will be.
+
+    With the type, dimensions and attributes of another; in chunks where it has two dimensions.
+    """
+    kept: dict[str, Any] = {}
+    if len(like.dims) == 2:
+        sizes = (file.dimensions[dim].size for dim in like.dims)
+        chunks = [min(pair) for pair in zip(sizes, _CHUNK, strict=True)]
+        kept = {"chunksizes": chunks, "chunk_cache": _CHUNK_CACHE}
+    made = file.createVariable(name, like.dtype, like.dims, fill_value=False, **kept)
+    made.setncatts(like.attrs)
+    return made
 
 
 def open_artifact(path: Path, *, cache: bool = True) -> xr.Dataset:

@@ -15,7 +15,7 @@ import netCDF4
 import xarray as xr
 
 from magtiles.pipeline import receipts
-from magtiles.pipeline.artifacts import open_artifact
+from magtiles.pipeline.artifacts import create_variable, open_artifact
 from magtiles.stages.field.laid import lay_on_plane
 from magtiles.stages.field.plane import choose_plane
 from magtiles.stages.field.windows import MapWindows
@@ -63,7 +63,7 @@ def _write(windows: MapWindows, path: Path) -> None:
             for name in map(str, strip.variables):
                 values = strip.variables[name]
                 if name not in file.variables:
-                    file.createVariable(name, values.dtype, values.dims, fill_value=False)
+                    create_variable(file, name, values)
                 rows = slice(first, first + strip.sizes["y"])
                 place = rows if "y" in values.dims else slice(None)
                 file[name][place] = values.values

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from magtiles.pipeline import receipts
-from magtiles.pipeline.artifacts import open_artifact, write_artifact
+from magtiles.pipeline.artifacts import create_variable, open_artifact, write_artifact
 from magtiles.pipeline.laid_map import lay, opened_map
 from magtiles.pipeline.tasks import Task, Tasks
 from magtiles.schemas import contracts
@@ -106,7 +106,7 @@ def begin(tasks: Tasks, jobs: Sequence[LevelJob]) -> list[list[Task[None]]]:
             asked[job.out] = [laid, tasks.submit(_make_whole, job, after=[laid])]
         blocks = _blocks(stale[0])
         for group in _groups(stale, len(blocks) * len(blocks[0]), tasks.workers):
-            for place in itertools.product(range(len(blocks)), range(len(blocks[0]))):
+            for place in _places(blocks):
                 wholes = [asked[job.out][1] for job in group]
                 made = tasks.submit(_make_blocks, group, place, after=wholes)
                 for job in group:
@@ -115,6 +115,10 @@ def begin(tasks: Tasks, jobs: Sequence[LevelJob]) -> list[list[Task[None]]]:
                 parts = asked[job.out][2:]
                 asked[job.out].append(tasks.submit(_make_level, job, blocks, after=parts))
     return list(asked.values())
+
+
+def _places(blocks: Sequence[Sequence[Block]]) -> Iterator[tuple[int, int]]:
+    return itertools.product(range(len(blocks)), range(len(blocks[0])))
 
 
 def _groups(jobs: Sequence[LevelJob], blocks: int, workers: int) -> list[Sequence[LevelJob]]:
@@ -170,6 +174,10 @@ def _write_block(block: xr.Dataset, out: Path, made_from: Mapping[str, Any]) -> 
 def _make_level(job: LevelJob, blocks: Sequence[Sequence[Block]]) -> None:
     """The level from its blocks, which then go. Raises MagtilesError for a full disk."""
     if receipts.why_stale(job.out, job.made_from) is not None:
+        # A worker of a build that was killed may have come late and put its own in their place.
+        _make_whole(job)
+        for place in _places(blocks):
+            _make_blocks([job], place)
         _write_level(job, blocks)
         receipts.write_receipt(job.out, job.made_from, contracts.resolve(STAGE.output))
     shutil.rmtree(job.folder, ignore_errors=True)
@@ -194,21 +202,14 @@ def _write_level(job: LevelJob, blocks: Sequence[Sequence[Block]]) -> None:
         level.setncatts(first.attrs)
         for name, axis in zip(target.dims, (target.rows, target.columns), strict=True):
             level.createDimension(name, axis.size)
-            _create(level, name, first)[...] = axis
+            create_variable(level, name, first[name].variable)[...] = axis
         for name in map(str, first.data_vars):
-            variable = _create(level, name, first)
+            variable = create_variable(level, name, first[name].variable)
             if variable.ndim:
                 _write_strips(variable, blocks, parts)
             else:
                 variable[...] = first[name].values
         level.setncatts(mean_angles(*(_mean(level[f"ambient_{axis}"]) for axis in _AXES)))
-
-
-def _create(level: Any, name: str, like: xr.Dataset) -> Any:
-    """A variable of a level as a block has it; every value will be written."""
-    variable = level.createVariable(name, like[name].dtype, like[name].dims, fill_value=False)
-    variable.setncatts(like[name].attrs)
-    return variable
 
 
 def _write_strips(

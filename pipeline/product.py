@@ -123,7 +123,7 @@ class AnomalyTable(Params):
         "1",
         default=None,
         ge=128,
-        doc="Make levels in blocks of so many nodes a side; default blocks of 2048 where the "
+        doc="Make levels in blocks of so many nodes a side; default blocks of 2560 where the "
         "survey has more than 3072 x 3072 nodes, or a level twice that.",
     )
 

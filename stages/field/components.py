@@ -58,7 +58,7 @@ class DeriveComponentsParams(Params):
         "1",
         default=None,
         ge=128,
-        doc="Transform in blocks of so many nodes a side; default blocks of 2048 where the grid "
+        doc="Transform in blocks of so many nodes a side; default blocks of 2560 where the grid "
         "has more than 3072 x 3072 nodes, or the output twice that.",
     )
 

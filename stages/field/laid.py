@@ -10,9 +10,10 @@ import xarray as xr
 from magtiles.catalog.flags import QualityFlag
 from magtiles.stages.field.prepare import PlaneMap
 from magtiles.stages.field.windows import MapWindows, spans
+from magtiles.stages.rows import strips
 
 _ROWS, _COLUMNS = 1024, 2048
-"""Nodes that are resampled at a time."""
+"""Nodes that are resampled at a time: of whole chunks of the file they go to."""
 
 
 def lay_on_plane(windows: MapWindows) -> Iterator[xr.Dataset]:
@@ -20,7 +21,7 @@ def lay_on_plane(windows: MapWindows) -> Iterator[xr.Dataset]:
 
     Anomaly (nT), its sigma and flags on (y, x) in plane metres, named as in the grid.
     """
-    for rows in spans(windows.shape[0], _ROWS):
+    for rows in strips(windows.shape, _ROWS * windows.shape[1]):
         yield _strip([windows.read(rows, c) for c in spans(windows.shape[1], _COLUMNS)])
 
 

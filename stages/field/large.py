@@ -21,20 +21,18 @@ from magtiles.stages.field.direction import AmbientSource
 from magtiles.stages.field.level import PRODUCTS
 from magtiles.stages.field.target import Nodes, Target, locate
 from magtiles.stages.field.whole import survey_whole
-from magtiles.stages.field.windows import MapWindows, Span, spans
+from magtiles.stages.field.windows import MapWindows, Span
+from magtiles.stages.rows import strips as row_strips
 
 Real = NDArray[np.float64]
 
 LARGEST = 3072 * 3072
-"""Nodes of a map that is still transformed at once, and half those of a level made at once.
-
-At once, a map of 2048 x 2048 took 1.3 GB, in blocks 0.6 GB; the one grows with the map.
-"""
+"""Nodes of a map that is still transformed at once, and half those of a level made at once."""
 BLOCK_NODES = 2560
-"""Of a block a side. Half of it takes a seventh longer for the margins, and 0.2 GB less."""
+"""Most nodes of a block a side. The fewer they are, the more of its work is for its margins."""
 _METRES_PER_DEGREE = 111_195.0
 _STRIP = 512
-"""Rows of a level that are put together at a time."""
+"""Rows of a level that are put together at a time: of whole chunks of its file."""
 
 
 def is_large(shape: tuple[int, int], target: tuple[int, int]) -> bool:
@@ -99,7 +97,7 @@ def strips(
     where blocks overlap; all else, which no transform makes, is the block's that owns the node.
     """
     shape = blocks[-1][-1].rows[1], blocks[-1][-1].columns[1]
-    for span in spans(shape[0], _STRIP):
+    for span in row_strips(shape, _STRIP * shape[1]):
         strip: NDArray[Any] | None = None
         for block in itertools.chain.from_iterable(blocks):
             rows = block.outer_rows if name in PRODUCTS else block.rows
