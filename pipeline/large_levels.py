@@ -40,7 +40,7 @@ from magtiles.stages.field.windows import spans
 from magtiles.stages.release.atomic import atomic_path
 from magtiles.stages.rows import strips as row_strips
 
-_TASKS_A_WORKER = 4
+_TASKS_A_WORKER, _IDLE = 3, 1 / 16
 _AXES = ("north", "east", "down")
 _UNREAD = (0.0, 1.0)
 """Stand-ins for what only solving needs to know of a map."""
@@ -124,9 +124,15 @@ def _places(blocks: Sequence[Sequence[Block]]) -> Iterator[tuple[int, int]]:
 def _groups(jobs: Sequence[LevelJob], blocks: int, workers: int) -> list[Sequence[LevelJob]]:
     """Levels of which a task makes a block: what they have in common is then done once.
 
-    As many as leave every worker some tasks to choose from. The files are the same in any case.
+    As many as leave every worker some tasks, and few without one in the last round. The files are
+    the same in any case.
     """
-    number = min(len(jobs), -(-_TASKS_A_WORKER * workers // blocks))
+    number = 1
+    while number < len(jobs):
+        tasks = number * blocks
+        if tasks >= _TASKS_A_WORKER * workers and -tasks % workers <= _IDLE * tasks:
+            break
+        number += 1
     return [jobs[slice(*span)] for span in spans(len(jobs), -(-len(jobs) // number))]
 
 
