@@ -41,6 +41,7 @@ from magtiles.stages.release.atomic import atomic_path
 from magtiles.stages.rows import strips as row_strips
 
 _TASKS_A_WORKER, _IDLE = 3, 1 / 16
+"""Tasks of blocks that each worker has at least, and what part of all may be wanting at the end."""
 _AXES = ("north", "east", "down")
 _UNREAD = (0.0, 1.0)
 """Stand-ins for what only solving needs to know of a map."""

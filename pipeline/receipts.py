@@ -50,7 +50,8 @@ def write_receipt(
 ) -> None:
     """Write the receipt of a finished artifact that has been checked against `contract`.
 
-    What is `passing`, and nothing else is made from by name, is known by its size and time alone.
+    One that is `passing`, which no receipt names as an input, is not hashed: once its size or
+    time of change is another, it counts as changed.
     """
     stat = artifact.stat()
     output = {

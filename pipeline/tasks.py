@@ -75,7 +75,7 @@ class Tasks:
     ) -> Task[Value]:
         """Ask for a call of a function of a module, once the tasks `after` are done."""
         if self._starting is None:
-            return Task(lambda: function(*arguments))
+            return Task(lambda: _here(function, arguments, after))
         client, waited = self._starting.result(), [task.future for task in after]
         key = f"{function.__name__.strip('_')}-{secrets.token_hex(8)}"
         return Task(
@@ -100,6 +100,14 @@ class Tasks:
                 _result(future)
             done(n)
         return [task.result() for task in tasks]
+
+
+def _here(
+    function: Callable[..., Value], arguments: Sequence[Any], after: Sequence[Task[Any]]
+) -> Value:
+    for task in after:
+        task.result()
+    return function(*arguments)
 
 
 def _counted(task: Task[Value], done: Callable[[int], None], number: int) -> Value:

@@ -140,6 +140,24 @@ def test_an_interrupted_level_goes_on_from_its_blocks(products, tmp_path):
     assert not job.folder.exists()
 
 
+def test_levels_are_the_same_one_at_a_time_and_together(products, tmp_path, monkeypatch):
+    first, here = jobs(products, tmp_path), Tasks()
+    params = [{"height_m": height, "block_nodes": 128} for height in (500.0, 1000.0, 20000.0)]
+    made = []
+    for name in ("together", "alone"):
+        levels = [
+            LevelJob.of(first.grid, p, tmp_path / name / f"{n}.nc") for n, p in enumerate(params)
+        ]
+        begun = large_levels.begin(here, levels)
+        shared = set(map(id, begun[0][2:-1])) & set(map(id, begun[2][2:-1]))
+        assert bool(shared) == (name == "together")
+        for tasks_of_level in begun:
+            here.results(tasks_of_level, lambda done: None)
+        made.append([receipts.digest(level.out) for level in levels])
+        monkeypatch.setattr(large_levels, "_groups", lambda jobs, *_: [[job] for job in jobs])
+    assert made[0] == made[1]
+
+
 def test_a_worker_that_dies_is_replaced(tmp_path, monkeypatch):
     # Workers cannot import this file: functions within functions are sent as they are.
     def die_once(mark: Path) -> int:
