@@ -19,7 +19,7 @@ from magtiles.pipeline.roads_part import build_roads
 from magtiles.pipeline.source_paths import check_there
 from magtiles.pipeline.steps import MapPlan, PartResult, Steps
 from magtiles.pipeline.survey_map import plan_survey_map
-from magtiles.pipeline.tasks import SCRATCH, Workplace, working
+from magtiles.pipeline.tasks import SCRATCH, Tasks, Workplace, working
 from magtiles.pipeline.temporal_part import build_temporal
 from magtiles.schemas.errors import CoverageError, MagtilesError, ParameterError, SourceError
 from magtiles.stages.ingest.unpack import scratch
@@ -158,7 +158,7 @@ def _build(
         more += wanted.map.surface.steps
     more += sum(roads.steps for roads in wanted.roads)
     steps = Steps(progress, total=4 + len(wanted.map.table.heights_m) + more)
-    with working(scheduler, folder) as place:
+    with working(scheduler, [folder, store / wanted.product.name]) as place:
         plan = _plan(wanted, folder, data, steps)
         parts = []
         if wanted.temporal is not None:
@@ -167,8 +167,8 @@ def _build(
         if wanted.roads:
             parts.append(build_roads(wanted.roads, folder, data, steps))
         levels, pictures, cut = _make_tiles(wanted, plan, folder, progress, place)
-    steps.report("publishing")
-    return _publish(wanted, store, plan, cut, levels, pictures, parts)
+        steps.report("publishing")
+        return _publish(wanted, store, plan, cut, levels, pictures, parts, place.tasks)
 
 
 def _make_tiles(
@@ -215,6 +215,7 @@ def _publish(
     levels: Sequence[Path],
     pictures: Sequence[Path],
     parts: Sequence[PartResult],
+    tasks: Tasks,
 ) -> PublishResult:
     extra = {f"preview/{picture.name}": picture for picture in pictures}
     if plan.core_field is not None:
@@ -233,6 +234,7 @@ def _publish(
         inputs=inputs,
         provenance=_provenance(wanted, plan, inputs, artifacts),
         extra_files=extra,
+        spread=tasks.map if tasks.in_cluster else None,
     )
 
 

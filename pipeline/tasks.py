@@ -9,18 +9,20 @@ import importlib.metadata
 import logging
 import secrets
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from magtiles.pipeline import receipts
 from magtiles.schemas.errors import MagtilesError, UsageError
+from magtiles.stages.release.atomic import writing
 
 if TYPE_CHECKING:
     import distributed
 
 Value = TypeVar("Value")
+Asked = TypeVar("Asked")
 
 _WORKER_BYTES = 2 << 30
 """Memory that one worker may need: a block of a large map, with what Python itself takes."""
@@ -28,6 +30,16 @@ _PATIENCE_S = 30
 _STARTS = 3
 _WORKERLESS_S = 300
 """How long a local cluster may be without workers: one that dies as it comes is not replaced."""
+CLUSTER_SETTINGS: Mapping[str, Any] = {
+    "distributed.scheduler.no-workers-timeout": f"{_WORKERLESS_S}s",
+    # A second task for a busy worker would wait while another worker has nothing to do.
+    "distributed.scheduler.worker-saturation": 1.0,
+    # To look at what a worker is doing every 10 ms takes time of it.
+    "distributed.worker.profile.enabled": False,
+    # To give memory back at every turn made blocks take a third longer.
+    "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": None,
+}
+"""How a cluster is best set up for a build."""
 _WORKERS_DIE = "check memory; a script that builds must do so below if __name__ == '__main__':"
 SCRATCH = ".scratch"
 """Name of the folder of a local cluster's own files, and of unpacked ones, in the build's."""
@@ -101,6 +113,10 @@ class Tasks:
             done(n)
         return [task.result() for task in tasks]
 
+    def map(self, function: Callable[[Asked], Value], over: Sequence[Asked]) -> list[Value]:
+        """What a function of a module gives for each of some arguments, in their order."""
+        return self.results([self.submit(function, each) for each in over], lambda _: None)
+
 
 def _here(
     function: Callable[..., Value], arguments: Sequence[Any], after: Sequence[Task[Any]]
@@ -117,14 +133,15 @@ def _counted(task: Task[Value], done: Callable[[int], None], number: int) -> Val
 
 
 @contextlib.contextmanager
-def working(scheduler: str | None, shared: Path) -> Iterator[Workplace]:
+def working(scheduler: str | None, shared: Sequence[Path]) -> Iterator[Workplace]:
     """Tasks, in the cluster at address `scheduler`, or in this process until more is asked for.
 
-    The cluster must see the folder `shared` and run this very code in workers of one thread:
-    MagtilesError if not, UsageError where there is none at the address.
+    The cluster must see the folders `shared`, of which the first is the build's, and run this
+    very code in workers of one thread: MagtilesError if not, UsageError where there is none at
+    the address.
     """
     with contextlib.ExitStack() as opened, concurrent.futures.ThreadPoolExecutor(1) as starter:
-        place = Workplace(Tasks(), shared, opened, starter)
+        place = Workplace(Tasks(), shared[0], opened, starter)
         if scheduler is not None:
             opened.enter_context(_garbage_collected_here())
             client = opened.enter_context(_connected(scheduler))
@@ -140,7 +157,7 @@ class Workplace:
     """Tasks, and what it takes to give them a local cluster."""
 
     tasks: Tasks
-    _shared: Path
+    _folder: Path
     _opened: contextlib.ExitStack
     _starter: concurrent.futures.Executor
 
@@ -148,7 +165,7 @@ class Workplace:
         """Have a local cluster, of a process per core, unless there is one; it starts meanwhile."""
         if not self.tasks.in_cluster:
             self._opened.enter_context(_garbage_collected_here())
-            cluster = _local_cluster(self._shared / SCRATCH)
+            cluster = _local_cluster(self._folder / SCRATCH)
             self.tasks.use(self._starter.submit(self._opened.enter_context, cluster))
 
 
@@ -179,14 +196,7 @@ def _local_cluster(scratch: Path) -> Iterator[distributed.Client]:
 
     try:
         with (
-            dask.config.set(
-                {
-                    "temporary-directory": str(scratch.absolute()),
-                    "distributed.scheduler.no-workers-timeout": f"{_WORKERLESS_S}s",
-                    # To give memory back at every turn made blocks take a third longer.
-                    "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": None,
-                }
-            ),
+            dask.config.set({**CLUSTER_SETTINGS, "temporary-directory": str(scratch.absolute())}),
             _started_cluster() as cluster,
             contextlib.closing(distributed.Client(cluster, set_as_default=False)) as client,
         ):
@@ -233,7 +243,7 @@ def _connected(scheduler: str) -> Iterator[distributed.Client]:
         yield client
 
 
-def _check_workers(client: distributed.Client, shared: Path) -> None:
+def _check_workers(client: distributed.Client, shared: Sequence[Path]) -> None:
     """Raise MagtilesError unless every worker can do our work as we would."""
     for address, worker in client.scheduler_info(n_workers=-1)["workers"].items():
         if worker["nthreads"] != 1:
@@ -249,32 +259,56 @@ def _check_workers(client: distributed.Client, shared: Path) -> None:
         raise MagtilesError(
             "a worker has no magtiles", where=client.scheduler.address, remedy="install it there"
         ) from caught
-    shared.mkdir(parents=True, exist_ok=True)
-    token = shared.absolute() / f".shared.{secrets.token_hex(8)}.tmp"
-    token.write_text(token.name, encoding="utf-8")
+    _compare(
+        client.run(_describe_worker),
+        _describe_worker(),
+        ("this version of magtiles", "these versions of libraries"),
+    )
+    for folder in shared:
+        _check_sight(client, folder.absolute())
+
+
+def _check_sight(client: distributed.Client, folder: Path) -> None:
+    """Raise MagtilesError unless every worker sees what is in a folder."""
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        token = folder / f".shared.{secrets.token_hex(8)}.tmp"
+        token.write_text(token.name, encoding="utf-8")
     try:
-        found = client.run(_describe_worker, token)
+        found = client.run(_read_token, token)
     finally:
         token.unlink(missing_ok=True)
-    ours = (token.name, receipts.code_digest(), receipts.package_versions())
-    names = ("the folder of this build", "this version of magtiles", "these versions of libraries")
+    for address, seen in found.items():
+        if seen != token.name:
+            raise MagtilesError(
+                "the worker does not see a folder of this build",
+                where=address,
+                expected=str(folder),
+                remedy="give it the same file system",
+            )
+
+
+def _compare(found: Mapping[str, Sequence[Any]], own: Sequence[Any], names: Sequence[str]) -> None:
     for address, theirs in found.items():
-        for name, own, its in zip(names, ours, theirs, strict=True):
-            if own != its:
+        for name, ours, its in zip(names, own, theirs, strict=True):
+            if ours != its:
                 raise MagtilesError(
                     f"the worker has not {name}",
                     where=address,
-                    expected=str(shared.absolute()) if own == token.name else str(own),
-                    remedy="give it the same file system and the same environment",
+                    expected=str(ours),
+                    remedy="give it the same environment",
                 )
 
 
-def _describe_worker(token: Path) -> tuple[str, str, dict[str, str]]:
+def _describe_worker() -> tuple[str, dict[str, str]]:
+    return receipts.code_digest(), receipts.package_versions()
+
+
+def _read_token(token: Path) -> str:
     try:
-        seen = token.read_text(encoding="utf-8")
+        return token.read_text(encoding="utf-8")
     except OSError:
-        seen = ""
-    return seen, receipts.code_digest(), receipts.package_versions()
+        return ""
 
 
 def _alone(function: Callable[..., Value], arguments: Sequence[Any], after: Sequence[Any]) -> Value:

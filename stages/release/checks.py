@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,11 +12,14 @@ from numpy.typing import NDArray
 
 from magtiles.catalog.releases.fields import Fields, parse_json
 from magtiles.catalog.releases.manifest import Manifest
-from magtiles.catalog.releases.reader import Release
+from magtiles.catalog.releases.reader import Release, open_release
 from magtiles.schemas.errors import IntegrityError
 from magtiles.stages.release import checks_roads, checks_temporal
 
 Arrays = dict[str, NDArray[Any]]
+Question = tuple[Path, Arrays]
+Spread = Callable[[Callable[[Question], Arrays], Sequence[Question]], Iterable[Arrays]]
+"""As `map`: applies a function of a module, in other processes for example."""
 
 CHECKS_NAME = "checks.json"
 FORMAT = "release-checks/1.0.0"
@@ -36,11 +40,11 @@ _UNITS = {
 }
 
 
-def make_checks(release: Release) -> dict[str, Any]:
+def make_checks(release: Release, spread: Spread | None = None) -> dict[str, Any]:
     """Positions in and around several tiles, and what the reader answers there.
 
     Positions spread over each tile's core (on and between levels) and lie on seams to
-    both sides. An expected null is NaN: no coverage.
+    both sides. An expected null is NaN: no coverage. Others may answer, through `spread`.
     """
     latitude, longitude, height = _positions(release.manifest)
     height_name = "height"
@@ -54,7 +58,7 @@ def make_checks(release: Release) -> dict[str, Any]:
         "tolerance": TOLERANCE,
         "units": _UNITS,
         "positions": {name: values.tolist() for name, values in positions.items()},
-        "expected": {name: _plain(v) for name, v in _answers(release, positions).items()},
+        "expected": {name: _plain(v) for name, v in _answers(release, positions, spread).items()},
     }
     if release.manifest.temporal is not None:
         at = checks_temporal.temporal_positions(release)
@@ -77,14 +81,15 @@ def _section(units: Mapping[str, str], at: Arrays, answers: Arrays) -> dict[str,
     }
 
 
-def replay_checks(release: Release) -> float:
+def replay_checks(release: Release, spread: Spread | None = None) -> float:
     """Ask the release its own checks; the largest error relative to the tolerance.
 
-    Raises IntegrityError naming the first answer that is off.
+    Others may answer, through `spread`, as in `make_checks`. Raises IntegrityError naming the
+    first answer that is off.
     """
     where = release.path / CHECKS_NAME
     document = parse_json(release.file(CHECKS_NAME), where)
-    worst = _replay(document, lambda at: _answers(release, at), where)
+    worst = _replay(document, lambda at: _answers(release, at, spread), where)
     if release.manifest.temporal is not None:
         temporal = document.inner("temporal")
         ask = partial(checks_temporal.temporal_answers, release)
@@ -120,11 +125,27 @@ def _replay(
     return worst
 
 
-def _answers(release: Release, at: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+def _answers(release: Release, at: Mapping[str, NDArray[Any]], spread: Spread | None) -> Arrays:
+    """What the anomaly is at positions, which are in order of tiles: a part asks few of them."""
+    if spread is None:
+        return _anomaly_answers(release, at)
+    parts = np.array_split(np.arange(len(at["latitude"])), _TILES)
+    asked = [
+        (release.path, {name: np.asarray(v)[part] for name, v in at.items()}) for part in parts
+    ]
+    found = list(spread(_answer, asked))
+    return {name: np.concatenate([part[name] for part in found]) for name in found[0]}
+
+
+def _answer(question: Question) -> Arrays:
+    return _anomaly_answers(open_release(question[0]), question[1])
+
+
+def _anomaly_answers(release: Release, at: Mapping[str, NDArray[Any]]) -> Arrays:
     an = release.anomaly
     total, total_gradient = an.total_with_gradient(**at)
     vector, vector_gradient = an.vector_with_gradient(**at)
-    answers: dict[str, NDArray[Any]] = {
+    answers: Arrays = {
         "total": total,
         "total_gradient": total_gradient,
         "vector": vector,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.metadata
 import json
 import os
@@ -37,7 +38,7 @@ from magtiles.catalog.releases.versions import (
 from magtiles.schemas import contracts
 from magtiles.schemas.errors import ContractError, SourceError, VersionError
 from magtiles.stages.release.atomic import remove_temporaries, sync, write_bytes, writing
-from magtiles.stages.release.checks import CHECKS_NAME, make_checks, replay_checks
+from magtiles.stages.release.checks import CHECKS_NAME, Spread, make_checks, replay_checks
 from magtiles.stages.release.lock import locked
 from magtiles.stages.release.provenance import CONTRACT as PROVENANCE_CONTRACT
 from magtiles.stages.release.provenance import build_date, statement
@@ -55,6 +56,7 @@ PROVENANCE_NAME = "provenance.json"
 
 _STAGING = ".staging."
 _LOCK_NAME = ".publish.lock"
+_COPIED_BYTES = 1 << 20
 _DEAD_S = 86400.0
 """Age after which what another machine left of a release is dead; publishing takes minutes."""
 _EXTRA_ROLES = {
@@ -84,6 +86,7 @@ def publish_release(
     inputs: Sequence[Mapping[str, Any]],
     provenance: Mapping[str, Any],
     extra_files: Mapping[str, Path],
+    spread: Spread | None = None,
 ) -> PublishResult:
     """Publish tiles as ``<store>/<product>/<version>``, read-only and never changed again.
 
@@ -98,6 +101,7 @@ def publish_release(
     extra_files : ``preview/*``, ``core_field.shc``, ``temporal.nc`` (as `write_temporal` makes
         it, and with a core field) and ``roads/*.nc`` (as `write_road` makes them, at
         `road_path`), path in the release to file.
+    spread : makes the release's checks, and tries them, elsewhere than here; as `map`.
 
     Returns
     -------
@@ -125,7 +129,7 @@ def publish_release(
         _remove_dead(home)
         changed = not _exists_already(home, _sealed(document))
         if changed:
-            _build(home, final, document, measured, extras, provenance)
+            _build(home, final, document, measured, extras, provenance, spread)
         _point_to_latest(home)
     return PublishResult(final, changed)
 
@@ -267,6 +271,7 @@ def _build(
     tiles: Sequence[MeasuredTile],
     files: Mapping[str, bytes],
     provenance: Mapping[str, Any],
+    spread: Spread | None,
 ) -> None:
     """Build in a temporary sibling and rename it to `final`; on failure nothing stays."""
     staging = home / f"{_STAGING}{socket.gethostname()}.{os.getpid()}"
@@ -274,12 +279,15 @@ def _build(
     try:
         (staging / "tiles").mkdir()
         with ThreadPoolExecutor(2) as threads:
-            for _ in threads.map(lambda tile: _copy(tile, staging), tiles):
-                pass
-        for path, data in files.items():
-            (staging / path).parent.mkdir(exist_ok=True)
-            (staging / path).write_bytes(data)
-        _complete(staging, document, provenance)
+            copies = list(threads.map(lambda tile: _copy(tile, staging), tiles))
+            # The disk takes them while the release is tried.
+            synced = [threads.submit(sync, copy) for copy in copies]
+            for path, data in files.items():
+                (staging / path).parent.mkdir(exist_ok=True)
+                (staging / path).write_bytes(data)
+            _complete(staging, document, provenance, spread)
+            for copy in synced:
+                copy.result()
         _protect(staging)
         _rename(staging, final)
     except BaseException:
@@ -288,18 +296,24 @@ def _build(
     sync(home)
 
 
-def _copy(tile: MeasuredTile, staging: Path) -> None:
+def _copy(tile: MeasuredTile, staging: Path) -> Path:
     # A hard link would let a later write to the work file change the release.
-    data = tile.source.read_bytes()
-    if sha256(data) != tile.entry["sha256"]:
+    copy, found = staging / str(tile.entry["path"]), hashlib.sha256()
+    with tile.source.open("rb") as source, copy.open("wb") as target:
+        while part := source.read(_COPIED_BYTES):
+            found.update(part)
+            target.write(part)
+    if found.hexdigest() != tile.entry["sha256"]:
         raise ContractError("changed while it was being published", where=tile.source)
-    (staging / str(tile.entry["path"])).write_bytes(data)
+    return copy
 
 
-def _complete(staging: Path, document: dict[str, Any], provenance: Mapping[str, Any]) -> None:
+def _complete(
+    staging: Path, document: dict[str, Any], provenance: Mapping[str, Any], spread: Spread | None
+) -> None:
     """Add checks, provenance and the final manifest, then read the release back and try it."""
     (staging / MANIFEST_NAME).write_bytes(_seal(document))
-    checks = canonical_json(make_checks(open_release(staging)))
+    checks = canonical_json(make_checks(open_release(staging), spread))
     (staging / CHECKS_NAME).write_bytes(checks)
     _add_files(document, {CHECKS_NAME: checks})
     made = canonical_json(_provenance(document, provenance))
@@ -307,7 +321,7 @@ def _complete(staging: Path, document: dict[str, Any], provenance: Mapping[str, 
     _add_files(document, {PROVENANCE_NAME: made})
     contracts.check_document(json.loads(_seal(document)), CONTRACT, where=MANIFEST_NAME)
     (staging / MANIFEST_NAME).write_bytes(_seal(document))
-    replay_checks(open_release(staging))
+    replay_checks(open_release(staging), spread)
 
 
 def _provenance(document: Mapping[str, Any], predicate: Mapping[str, Any]) -> dict[str, Any]:

@@ -14,6 +14,7 @@ no other process shares with its own. Name sizes after ``sizes`` to do only thos
 
 from __future__ import annotations
 
+import contextlib
 import json
 import statistics
 import subprocess
@@ -36,6 +37,7 @@ import xarray as xr
 
 from magtiles.pipeline.artifacts import open_artifact
 from magtiles.pipeline.build import build_product
+from magtiles.pipeline.tasks import CLUSTER_SETTINGS
 from magtiles.stages.field.components import DeriveComponentsParams, derive_components
 from magtiles.stages.field.level import PRODUCTS, SIGMAS
 from magtiles.stages.field.voids import FillVoidsParams, fill_voids
@@ -158,7 +160,10 @@ def memory() -> None:
 
 def workers() -> None:
     """Time of one build in blocks by one worker, and by two."""
-    made = [in_process(WORKERS_SIZE, WORKERS_BLOCK, count, LEVELS_M) for count in (1, 2)]
+    # To watch their memory takes time from two workers, and none from one.
+    made = [
+        in_process(WORKERS_SIZE, WORKERS_BLOCK, count, LEVELS_M, watched=False) for count in (1, 2)
+    ]
     for count, found in enumerate(made, 1):
         steps = {step: [round(s, 1) for s in both] for step, both in found["steps"].items()}
         print(f"  {count} workers: {found['seconds']:.1f} s, of it (and of a processor) {steps}")
@@ -166,31 +171,36 @@ def workers() -> None:
     print(f"two workers are {one / two:.2f} times as fast (asked: at least 1.6)")
 
 
-def in_process(size: int, block: int | None, count: int, levels: Sequence[float]) -> dict[str, Any]:
+def in_process(
+    size: int, block: int | None, count: int, levels: Sequence[float], watched: bool = True
+) -> dict[str, Any]:
     """What `build` prints, in a process of its own."""
-    command = [sys.executable, __file__, "build", json.dumps([size, block, count, levels])]
+    arguments = json.dumps([size, block, count, levels, watched])
+    command = [sys.executable, __file__, "build", arguments]
     printed = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
     made: dict[str, Any] = json.loads(printed.splitlines()[-1])
     return made
 
 
-def build(size: int, block: int | None, count: int, levels: Sequence[float]) -> None:
+def build(size: int, block: int | None, count: int, levels: Sequence[float], watched: bool) -> None:
     """Build a map of that size with so many workers and print, as JSON, what it took."""
     with (
-        dask.config.set({"distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": None}),
+        dask.config.set(CLUSTER_SETTINGS),
         distributed.LocalCluster(
             n_workers=count, threads_per_worker=1, dashboard_address="127.0.0.1:0", memory_limit=0
         ) as cluster,
     ):
         address = cluster.scheduler_address
         small = [built(SMALL, None, address, levels) for _ in range(2)][1]
-        made = built(size, block, address, levels)
+        made = built(size, block, address, levels, watched)
         made["nodes"] -= small["nodes"]
         print(json.dumps(made | {"fixed_s": small["processor_s"]}))
 
 
-def built(size: int, block: int | None, scheduler: str, levels: Sequence[float]) -> dict[str, Any]:
-    """What it took to build a map of that size."""
+def built(
+    size: int, block: int | None, scheduler: str, levels: Sequence[float], watched: bool = False
+) -> dict[str, Any]:
+    """What it took to build a map of that size; memory where that is watched."""
     bench_chain.SIZE = size
     steps: dict[str, list[float]] = {}
     last: list[Any] = [0.0, 0.0, "start"]
@@ -207,7 +217,8 @@ def built(size: int, block: int | None, scheduler: str, levels: Sequence[float])
         product = bench_chain.write_inputs(folder)
         text = product.read_text().replace(str(list(bench_chain.LEVELS_M)), str(list(levels)))
         product.write_text(text + (f"block_nodes = {block}\n" if block else ""))
-        with Watch() as memory:
+        memory = Watch()
+        with memory if watched else contextlib.nullcontext():
             last[:] = time.perf_counter(), processor_s(), "start"
             result = build_product(
                 product,

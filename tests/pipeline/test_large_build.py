@@ -6,7 +6,7 @@ import contextlib
 import hashlib
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -174,7 +174,7 @@ def test_a_worker_that_dies_is_replaced(tmp_path, monkeypatch):
         raise CoverageError("too far", where="there", expected="nearer", remedy="come back")
 
     monkeypatch.setattr(tasks, "_WORKER_BYTES", 1 << 62)  # one worker
-    with working(None, tmp_path) as place:
+    with working(None, [tmp_path]) as place:
         place.expand()
         before = place.tasks.submit(os.getpid).result()
         died = place.tasks.submit(die_once, tmp_path / "mark")
@@ -201,27 +201,31 @@ def test_a_scheduler_that_is_not_there(products, tmp_path, monkeypatch):
 
 
 def test_workers_that_cannot_do_our_work_are_refused(tmp_path, monkeypatch):
+    folders = [tmp_path, tmp_path / "store"]
     with cluster(threads=2) as address, pytest.raises(MagtilesError, match="has 2 threads"), \
-            working(address, tmp_path):  # fmt: skip
+            working(address, folders):  # fmt: skip
         pass
+    code, packages = tasks._describe_worker()
     with cluster() as address:
-        ours = receipts.code_digest()
-        for found, what in (
-            (("", ours, receipts.package_versions()), f"expected {tmp_path}"),
-            ((None, "other", receipts.package_versions()), "has not this version of magtiles"),
-            ((None, ours, {"numpy": "1.0"}), "has not these versions of libraries"),
+        for function, found, what in (
+            ("_describe_worker", ("other", packages), "has not this version of magtiles"),
+            ("_describe_worker", (code, {"numpy": "1"}), "has not these versions of libraries"),
+            ("_read_token", "", f"does not see .*expected {folders[0]}"),
         ):
-            monkeypatch.setattr(tasks, "_describe_worker", Described(found))
-            with pytest.raises(MagtilesError, match=what), working(address, tmp_path):
-                pass
-    assert not list(tmp_path.iterdir())
+            with monkeypatch.context() as patched:
+                patched.setattr(tasks, function, AnsweredByWorker(found, getattr(tasks, function)))
+                with pytest.raises(MagtilesError, match=what), working(address, folders):
+                    pass
+        with working(address, folders):
+            pass
+    assert [*tmp_path.rglob("*")] == [folders[1]]
 
 
-class Described:
-    """A worker that says what it was told to, and the token where that is None."""
+class AnsweredByWorker:
+    """A function that gives something else in a worker, which alone is given itself."""
 
-    def __init__(self, found: tuple) -> None:
-        self.found = found
+    def __init__(self, found: object, function: Callable) -> None:
+        self.found, self.function = found, function
 
-    def __call__(self, token: Path) -> tuple:
-        return (token.read_text() if self.found[0] is None else self.found[0], *self.found[1:])
+    def __call__(self, *arguments: object, dask_worker: object = None) -> object:
+        return self.function(*arguments) if dask_worker is None else self.found

@@ -20,7 +20,7 @@ def test_work_that_no_worker_is_left_for_is_an_error(tmp_path, monkeypatch):
 
     monkeypatch.setattr(tasks, "_WORKER_BYTES", 1 << 62)  # one worker
     monkeypatch.setattr(tasks, "_WORKERLESS_S", 1)
-    with working(None, tmp_path) as place:
+    with working(None, [tmp_path]) as place:
         place.expand()
         place.tasks.submit(os.getpid).result()
         (nanny,) = place.tasks._starting.result().cluster.workers.values()
