@@ -46,8 +46,8 @@ COMPARED, SPACING_M = 3000, 250.0
 GAINS_M = (0.0, 500.0, 2000.0)
 LOW = {"inclination_deg": 8.0, "declination_deg": 37.0}
 SIZES = (1024, 2048, 4096, 8192)
-COST_LEVELS_M = (800.0, 2300.0)
-MEMORY_SIZE, LEVELS_M = 4096, (800.0, 1300.0, 2300.0, 4300.0)
+BUILT_SPACING_M, COST_LEVELS_M = 100.0, (500.0, 1100.0)
+MEMORY_SIZE, LEVELS_M = 4096, (500.0, 700.0, 1100.0, 1900.0)
 WORKERS_SIZE, WORKERS_BLOCK = 3000, 1024
 SMALL = 256
 
@@ -201,7 +201,7 @@ def built(
     size: int, block: int | None, scheduler: str, levels: Sequence[float], watched: bool = False
 ) -> dict[str, Any]:
     """What it took to build a map of that size; memory where that is watched."""
-    bench_chain.SIZE = size
+    bench_chain.SIZE, bench_chain.SPACING_M = size, BUILT_SPACING_M
     steps: dict[str, list[float]] = {}
     last: list[Any] = [0.0, 0.0, "start"]
 

@@ -46,7 +46,7 @@ height_reference = "ellipsoid"
 
 
 def write_inputs(folder: Path) -> Path:
-    """A GeoTIFF of smoothed noise, 512 km a side, with its source and product TOML."""
+    """A GeoTIFF of smoothed noise, with its source and product TOML."""
     rng = np.random.default_rng(1)
     k = np.hypot(*np.meshgrid(np.fft.fftfreq(SIZE), np.fft.rfftfreq(SIZE), indexing="ij"))
     spectrum = scipy.fft.rfft2(rng.standard_normal((SIZE, SIZE))) * np.exp(-18 * k)
