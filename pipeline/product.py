@@ -16,6 +16,7 @@ from magtiles.pipeline.source_paths import find_source
 from magtiles.pipeline.temporal_part import TemporalSources, TemporalTable, load_temporal
 from magtiles.schemas.errors import SourceError
 from magtiles.stages.declare import IsoDate, Params, parse_params, quantity
+from magtiles.stages.field.direction import DECLINATION_DEG, INCLINATION_DEG
 from magtiles.stages.ingest.field_model import FIELD_MODEL, igrf_coefficients, model_files
 from magtiles.stages.ingest.source import (
     ANOMALY_GRID,
@@ -106,16 +107,8 @@ class AnomalyTable(Params):
     tile_deg: float | None = quantity(
         "degree", default=None, gt=0, le=90, doc="Size of a tile; default some 300 cells or more."
     )
-    inclination_deg: float | None = quantity(
-        "degree",
-        default=None,
-        ge=-90,
-        le=90,
-        doc="Ambient inclination; default the reference field's at its epoch.",
-    )
-    declination_deg: float | None = quantity(
-        "degree", default=None, ge=-180, le=180, doc="Ambient declination, with inclination_deg."
-    )
+    inclination_deg: float | None = INCLINATION_DEG
+    declination_deg: float | None = DECLINATION_DEG
     allow_downward_continuation: bool = quantity(
         "1", default=False, doc="Permit levels below the survey (flagged)."
     )

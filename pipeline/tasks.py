@@ -28,10 +28,9 @@ _WORKER_BYTES = 2 << 30
 """Memory that one worker may need: a block of a large map, with what Python itself takes."""
 _PATIENCE_S = 30
 _STARTS = 3
-_WORKERLESS_S = 300
-"""How long a local cluster may be without workers: one that dies as it comes is not replaced."""
 CLUSTER_SETTINGS: Mapping[str, Any] = {
-    "distributed.scheduler.no-workers-timeout": f"{_WORKERLESS_S}s",
+    # Without a worker, since one that dies as it comes is not replaced.
+    "distributed.scheduler.no-workers-timeout": "300s",
     # A second task for a busy worker would wait while another worker has nothing to do.
     "distributed.scheduler.worker-saturation": 1.0,
     # To look at what a worker is doing every 10 ms takes time of it.

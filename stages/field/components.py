@@ -13,7 +13,7 @@ from magtiles.schemas.errors import ContractError, CoverageError, ParameterError
 from magtiles.stages.declare import Params, Stage, quantity
 from magtiles.stages.field.at_nodes import evaluate_products, quality_flags
 from magtiles.stages.field.blocks import Block
-from magtiles.stages.field.direction import Ambient, AmbientSource
+from magtiles.stages.field.direction import DECLINATION_DEG, INCLINATION_DEG, Ambient, AmbientSource
 from magtiles.stages.field.laid import lay_on_plane
 from magtiles.stages.field.large import LargeMap, is_large, strips
 from magtiles.stages.field.level import OF_DATUM, assemble_level, mean_angles, wgs84_variable
@@ -36,16 +36,8 @@ class DeriveComponentsParams(Params):
     allow_downward_continuation: bool = quantity(
         "1", default=False, doc="Permit a negative height gain, which amplifies noise."
     )
-    inclination_deg: float | None = quantity(
-        "degree",
-        default=None,
-        ge=-90,
-        le=90,
-        doc="Ambient inclination; default the reference field's at its epoch.",
-    )
-    declination_deg: float | None = quantity(
-        "degree", default=None, ge=-180, le=180, doc="Ambient declination, with inclination_deg."
-    )
+    inclination_deg: float | None = INCLINATION_DEG
+    declination_deg: float | None = DECLINATION_DEG
     latitude: Axis | None = quantity(
         "degrees_north",
         default=None,

@@ -11,9 +11,22 @@ from numpy.typing import NDArray
 
 from magtiles.catalog.models import FieldModel, evaluate, load_igrf, read_model
 from magtiles.schemas.errors import CoverageError, ParameterError
+from magtiles.stages.declare import quantity
 from magtiles.stages.ingest.field_model import igrf_coefficients
 
 Real = NDArray[np.float64]
+
+INCLINATION_DEG: float | None = quantity(
+    "degree",
+    default=None,
+    ge=-90,
+    le=90,
+    doc="Ambient inclination; default the reference field's at its epoch.",
+)
+DECLINATION_DEG: float | None = quantity(
+    "degree", default=None, ge=-180, le=180, doc="Ambient declination, with inclination_deg."
+)
+"""Parameters of stages and products that give the direction by hand."""
 
 _log = logging.getLogger(__name__)
 

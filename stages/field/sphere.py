@@ -18,7 +18,7 @@ from magtiles.catalog.flags import QualityFlag
 from magtiles.catalog.kernels.dipole import geodetic_to_ecef
 from magtiles.schemas.errors import ContractError, CoverageError
 from magtiles.stages.declare import Params, Stage, quantity
-from magtiles.stages.field.direction import AmbientSource
+from magtiles.stages.field.direction import DECLINATION_DEG, INCLINATION_DEG, AmbientSource
 from magtiles.stages.field.geometry import axes, is_geographic, is_whole_circle
 from magtiles.stages.field.harmonic_nodes import Circle, crust_products, static_model
 from magtiles.stages.field.level import OF_DATUM, assemble_level, wgs84_variable
@@ -48,16 +48,8 @@ class SphereComponentsParams(Params):
     allow_downward_continuation: bool = quantity(
         "1", default=False, doc="Permit a negative height gain (flagged)."
     )
-    inclination_deg: float | None = quantity(
-        "degree",
-        default=None,
-        ge=-90,
-        le=90,
-        doc="Ambient inclination; default the reference field's at its epoch.",
-    )
-    declination_deg: float | None = quantity(
-        "degree", default=None, ge=-180, le=180, doc="Ambient declination, with inclination_deg."
-    )
+    inclination_deg: float | None = INCLINATION_DEG
+    declination_deg: float | None = DECLINATION_DEG
     latitude: Axis = quantity("degrees_north", doc="Nodes: first, spacing, count (WGS84).")
     longitude: Axis = quantity("degrees_east", doc="Nodes: first, spacing, count (WGS84).")
 

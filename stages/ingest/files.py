@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from magtiles.schemas.errors import FormatError
+from magtiles.stages.ingest.first_bytes import first_bytes
 from magtiles.stages.ingest.geosoft import is_geosoft
 from magtiles.stages.ingest.xyz import is_xyz, odd_line
 
@@ -40,19 +41,7 @@ def sniff(path: Path) -> str:
 
     Raises FormatError for a missing, empty or unreadable file, a folder, and other formats.
     """
-    if path.is_dir():
-        raise FormatError("is a folder", where=path, expected="a grid file")
-    try:
-        with path.open("rb") as file:
-            head = file.read(_HEAD_BYTES)
-    except FileNotFoundError:
-        raise FormatError(
-            "the file does not exist", where=path, remedy="fetch it or correct the path"
-        ) from None
-    except OSError as caught:
-        raise FormatError(f"cannot be read: {caught.strerror}", where=path) from None
-    if not head:
-        raise FormatError("the file is empty", where=path, remedy="fetch it again")
+    head = first_bytes(path, _HEAD_BYTES, "a grid file")
     for magic, kind in _MAGIC.items():
         if head.startswith(magic):
             return kind

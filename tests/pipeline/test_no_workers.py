@@ -19,7 +19,7 @@ def test_work_that_no_worker_is_left_for_is_an_error(tmp_path, monkeypatch):
         os.kill(os.getpid(), signal.SIGKILL)
 
     monkeypatch.setattr(tasks, "_WORKER_BYTES", 1 << 62)  # one worker
-    monkeypatch.setattr(tasks, "_WORKERLESS_S", 1)
+    monkeypatch.setitem(tasks.CLUSTER_SETTINGS, "distributed.scheduler.no-workers-timeout", "1s")
     with working(None, [tmp_path]) as place:
         place.expand()
         place.tasks.submit(os.getpid).result()

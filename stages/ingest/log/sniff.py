@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from magtiles.schemas.errors import FormatError
+from magtiles.stages.ingest.first_bytes import first_bytes
 from magtiles.stages.ingest.log.trackline import is_mgd77
 
 _MAGIC = {
@@ -25,19 +26,7 @@ _HEAD_BYTES = 4096
 
 def log_format(path: Path) -> str:
     """The name of the format. Raises FormatError for what is no log, empty or unreadable."""
-    if path.is_dir():
-        raise FormatError("is a folder", where=path, expected="a log file")
-    try:
-        with path.open("rb") as file:
-            head = file.read(_HEAD_BYTES)
-    except FileNotFoundError:
-        raise FormatError(
-            "the file does not exist", where=path, remedy="fetch it or correct the path"
-        ) from None
-    except OSError as caught:
-        raise FormatError(f"cannot be read: {caught.strerror}", where=path) from None
-    if not head:
-        raise FormatError("the file is empty", where=path, remedy="fetch it again")
+    head = first_bytes(path, _HEAD_BYTES, "a log file")
     for magic, name in _MAGIC.items():
         if head.startswith(magic):
             return name
