@@ -15,7 +15,7 @@ from grid_files import SMALL, Rows, Writer, gdal, geosoft, in_gzip, in_zip, old_
 
 from magtiles.schemas import contracts
 from magtiles.schemas.errors import FormatError, MagtilesError, SourceError
-from magtiles.stages.ingest import unpack
+from magtiles.stages.ingest import unpack, xyz
 from magtiles.stages.ingest.grid import STAGE, ingest_grid
 from magtiles.stages.ingest.source import IngestGridParams
 
@@ -181,6 +181,30 @@ def test_damaged_files_are_refused(refuse: Refuse, tmp_path: Path) -> None:
     params = IngestGridParams(crs="EPSG:32610", **(_SAID | dict(refuse.keys)))
     with pytest.raises(refuse.error, match=refuse.message):
         ingest_grid(refuse.write(tmp_path), params=params)
+
+
+@pytest.mark.parametrize("lines", [1, 5])
+def test_rows_read_in_parts_are_the_same_grid(
+    lines: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(xyz, "_PART_LINES", lines)
+    for expect in READ:
+        if expect.id in ("xyz", "csv", "csv-void"):
+            test_a_grid_is_the_same_in_every_format(expect, tmp_path)
+    for refuse in REFUSED:
+        if refuse.id.startswith("xyz"):
+            test_damaged_files_are_refused(refuse, tmp_path)
+
+
+def test_scattered_points_are_told_before_they_are_all_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(xyz, "_PART_LINES", 10)
+    monkeypatch.setattr(xyz, "_LONGEST", 20)
+    path = tmp_path / "points.xyz"
+    path.write_text("".join(f"{i**1.5:.3f} {i % 7} 1\n" for i in range(1000)))
+    with pytest.raises(FormatError, match="the first 30 lines have more than 20 different x or y"):
+        ingest_grid([path], params=IngestGridParams(crs="EPSG:32610", **_SAID))
 
 
 def test_a_bomb_is_not_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
