@@ -15,6 +15,7 @@ from pathlib import Path, PurePosixPath
 from typing import Protocol
 
 from magtiles.schemas.errors import FormatError, SourceError
+from magtiles.stages.release.atomic import writing
 
 
 class _Readable(Protocol):
@@ -41,7 +42,7 @@ def unpacked(path: Path, member: str | None = None) -> Iterator[Path]:
         that belong to it (a data file beside its header) are unpacked with it.
 
     Raises FormatError for a damaged archive or one that unpacks to more than 16 GiB;
-    SourceError where the member is not clear.
+    SourceError where the member is not clear; MagtilesError where it cannot be written.
     """
     kind = _kind(path)
     if kind is None:
@@ -122,7 +123,8 @@ def _choose(found: list[PurePosixPath], path: Path, member: str | None) -> PureP
 
 def _copy(packed: _Readable, out: Path, path: Path) -> None:
     written = 0
-    with out.open("wb") as file:
+    # Without a buffer, which would be written once more, and fail again, where it is closed.
+    with out.open("wb", buffering=0) as file:
         while block := packed.read(_BLOCK_BYTES):
             written += len(block)
             if written > min(_LIMIT_BYTES, shutil.disk_usage(out.parent).free + written):
@@ -130,4 +132,6 @@ def _copy(packed: _Readable, out: Path, path: Path) -> None:
                     f"unpacks to more than {_LIMIT_BYTES >> 30} GiB, or than there is room for",
                     where=path,
                 )
-            file.write(block)
+            with writing(out):
+                while block:
+                    block = block[file.write(block) :]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import resource
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -213,6 +214,17 @@ def test_a_bomb_is_not_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     path.write_bytes(gzip.compress(bytes(10_000)))
     with pytest.raises(FormatError, match="unpacks to more than"):
         ingest_grid([path], params=IngestGridParams(**_SAID))
+
+
+def test_a_full_disk_is_not_the_archives_fault(tmp_path: Path) -> None:
+    files = in_gzip(text(" "))(tmp_path)
+    least, most = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, most))
+    try:
+        with pytest.raises(MagtilesError, match=r"grid.xyz: cannot be written .*check free space"):
+            ingest_grid(files, params=IngestGridParams(crs="EPSG:32610", **_SAID))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (least, most))
 
 
 def test_a_column_of_uncertainty(tmp_path: Path) -> None:
