@@ -129,10 +129,9 @@ def _answers(release: Release, at: Mapping[str, NDArray[Any]], spread: Spread | 
     """What the anomaly is at positions, which are in order of tiles: a part asks few of them."""
     if spread is None:
         return _anomaly_answers(release, at)
+    folder = release.path.absolute()  # who answers may be elsewhere
     parts = np.array_split(np.arange(len(at["latitude"])), _TILES)
-    asked = [
-        (release.path, {name: np.asarray(v)[part] for name, v in at.items()}) for part in parts
-    ]
+    asked = [(folder, {name: np.asarray(v)[part] for name, v in at.items()}) for part in parts]
     found = list(spread(_answer, asked))
     return {name: np.concatenate([part[name] for part in found]) for name in found[0]}
 
