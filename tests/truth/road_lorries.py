@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,23 +15,16 @@ from unittest import mock
 
 import numpy as np
 from numpy.typing import NDArray
-from road_sample import MAPS, opened, passes_of
+from road_sample import MAPS, build, opened, passes_of
 
 from magtiles.catalog.kernels.dipole import dipole_vector
-from magtiles.pipeline.progress import silent
-from magtiles.pipeline.road_sources import RoadsTable, load_roads
-from magtiles.pipeline.roads_part import build_roads
 from magtiles.pipeline.sample_drives import (
     LOOP,
     LOT,
     MAPPING,
     PASSES,
     ROAD,
-    roads_tables,
-    write_drives,
 )
-from magtiles.pipeline.steps import Steps
-from magtiles.stages.declare import parse_params
 from magtiles.stages.road import merge
 from magtiles.stages.road.statistics import Statistics
 from magtiles.stages.road.transient import drop_transients
@@ -111,11 +103,8 @@ class Aligned:
 def aligned(folder: Path, seed: int) -> list[Aligned]:
     """Make the drives over the sample's roads with other steel; their passes, each on the first."""
     roads = [replace(road, seed=road.seed + seed, passing=()) for road in (LOOP, ROAD)]
-    write_drives(folder / "drives", [LOT, *roads])
-    tables = tomllib.loads("\n".join(roads_tables("drives")))["roads"]
-    wanted = [parse_params(RoadsTable, table, where="roads") for table in tables]
-    build_roads(load_roads(wanted, folder / "x.toml"), folder, None, Steps(silent, 0))
-    return [_aligned(name, folder / "roads") for name in MAPS]
+    made = build(folder, [LOT, *roads])
+    return [_aligned(name, made) for name in MAPS]
 
 
 def _aligned(name: str, roads: Path) -> Aligned:

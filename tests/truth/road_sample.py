@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -47,9 +47,9 @@ _ABOVE_M = 1.0  # the mean height of the vehicles' sensors
 _STEPS_M = 0.1
 
 
-def build(folder: Path) -> Path:
+def build(folder: Path, roads: Sequence[Road] = (LOT, LOOP, ROAD)) -> Path:
     """Make the sample's drives and all of their maps; the folder of the artifacts."""
-    write_drives(folder / "drives", [LOT, LOOP, ROAD])
+    write_drives(folder / "drives", roads)
     tables = tomllib.loads("\n".join(roads_tables("drives")))["roads"]
     wanted = [parse_params(RoadsTable, table, where="roads") for table in tables]
     build_roads(load_roads(wanted, folder / "x.toml"), folder, None, Steps(silent, 0))
