@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from magtiles.catalog.releases.manifest import MANIFEST_NAME
 from magtiles.pipeline import receipts
 from magtiles.pipeline.cutting import Cutter, worth_processes
 from magtiles.pipeline.model_map import plan_model_map
@@ -21,7 +22,14 @@ from magtiles.pipeline.steps import MapPlan, PartResult, Steps
 from magtiles.pipeline.survey_map import plan_survey_map
 from magtiles.pipeline.tasks import SCRATCH, Tasks, Workplace, working
 from magtiles.pipeline.temporal_part import build_temporal
-from magtiles.schemas.errors import CoverageError, MagtilesError, ParameterError, SourceError
+from magtiles.schemas.errors import (
+    CoverageError,
+    MagtilesError,
+    MissingInputError,
+    ParameterError,
+    SourceError,
+)
+from magtiles.stages.ingest.source import load_toml
 from magtiles.stages.ingest.unpack import scratch
 from magtiles.stages.release.atomic import remove_temporaries, writing
 from magtiles.stages.release.lock import locked
@@ -56,11 +64,13 @@ def build_product(
     Raises MagtilesError subclasses for bad sources, data, parameters and versions.
     """
     _refuse_workers(product)
-    wanted = load_product(product)
+    with _told_of_release(product, store):
+        wanted = load_product(product)
+        for source in wanted.sources:
+            check_there(source, data)
     folder = work / wanted.product.name
     for written in (store / wanted.product.name, folder):
         _check_writable(written)
-    _check_inputs(wanted, store, data)
     with _asked_by(product), _alone_in(folder):
         return _build(wanted, store, folder, data, progress, scheduler)
 
@@ -132,17 +142,29 @@ def _asked_by(product: Path) -> Iterator[None]:
         ) from error
 
 
-def _check_inputs(wanted: Product, store: Path, data: Path | None) -> None:
-    """Raise SourceError, before the work, for data files that are not there."""
+@contextlib.contextmanager
+def _told_of_release(product: Path, store: Path) -> Iterator[None]:
+    """Say of inputs that are not there which release was once built from them, and stays."""
     try:
-        for source in wanted.sources:
-            check_there(source, data)
-    except SourceError as error:
-        release = store / wanted.product.name / wanted.product.version
-        if not release.is_dir():
+        yield
+    except MissingInputError as error:
+        release = _release_of(product, store)
+        if release is None:
             raise
         what = f"{error.what}; {release}, built from it, stays as it is and may be stale"
-        raise SourceError(what, where=error.where, remedy=error.remedy) from error
+        raise MissingInputError(
+            what, where=error.where, expected=error.expected, remedy=error.remedy
+        ) from error
+
+
+def _release_of(product: Path, store: Path) -> Path | None:
+    """The release of a product TOML, if there are both; the rest of the TOML may be wrong."""
+    try:
+        table = load_toml(product, lists=("roads",))["product"]
+        release = store / str(table["name"]) / str(table["version"])
+    except (SourceError, KeyError):
+        return None
+    return release if (release / MANIFEST_NAME).is_file() else None
 
 
 def _build(

@@ -9,7 +9,7 @@ from typing import Any
 
 from magtiles.pipeline import receipts
 from magtiles.pipeline.fetching import cache_folder, catalog_sources
-from magtiles.schemas.errors import SourceError
+from magtiles.schemas.errors import MissingInputError, SourceError
 from magtiles.stages.ingest.source import Source
 
 _CATALOG = Path(str(resources.files("magtiles.catalog"))) / "sources"
@@ -24,7 +24,7 @@ def find_source(name: str, product: Path, key: str) -> Path:
         found = product.parent / name
         if found.is_file():
             return found
-        raise SourceError(
+        raise MissingInputError(
             f"source '{name}' does not exist",
             where=f"{product} {key}",
             expected=f"a file at {found}",
@@ -52,13 +52,13 @@ def data_files(source: Source[Any], data: Path | None) -> list[Path]:
 
 
 def check_there(source: Source[Any], data: Path | None) -> None:
-    """Raise SourceError for a source whose data files are not all there."""
+    """Raise MissingInputError for a source whose data files are not all there."""
     files = data_files(source, data)
     missing = [file for file in files if not file.is_file()]
     if not missing:
         return
     fetched = source.path.parent == _CATALOG and data is None
-    raise SourceError(
+    raise MissingInputError(
         f"{len(missing)} of the {len(files)} data files of '{source.source.id}' "
         f"{'is' if len(missing) == 1 else 'are'} missing: no file {missing[0]}",
         where=source.path,

@@ -65,6 +65,10 @@ class SourceError(MagtilesError):
     """A source or product TOML lacks, misspells or contradicts something."""
 
 
+class MissingInputError(SourceError):
+    """A file that a source or product TOML names is not there."""
+
+
 class FormatError(MagtilesError):
     """A file is not what its name or header says: truncated, empty, another format."""
 

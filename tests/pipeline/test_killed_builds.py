@@ -119,6 +119,10 @@ def test_a_file_in_the_place_of_a_folder(product, tmp_path):
 
 def test_an_input_that_disappears_makes_its_release_stale(product, built, tmp_path):
     copied = Path(shutil.copytree(product.parent, tmp_path / "in"))
+    description = (copied / "small-survey.toml").rename(tmp_path / "away.toml")
+    with pytest.raises(SourceError, match=r"small-survey\.toml.* built from it, stays as it is"):
+        build_product(copied / "small.toml", store=built / "store", work=built / "work")
+    description.rename(copied / "small-survey.toml")
     (copied / "small-survey.tif.gz").unlink()
     stale = r"small-survey\.toml: 1 of the 1 data files of 'small-survey' is missing: no file .*"
     with pytest.raises(SourceError, match=stale + "1.0.0, built from it, stays as it is and may"):
