@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
+from contract_tables import assert_tabulated
 from road_maps import Road, road_map
 from synthetic_release import World
 from tampering import (
@@ -181,17 +182,7 @@ def test_what_is_written_is_what_was_given(whole: Path) -> None:
 
 def test_the_table_is_the_contract() -> None:
     """Dimensions, dtypes and units of the reader's table are those of road-map/1."""
-    schema = contracts.load_schema("road-map/1")["properties"]["variables"]
+    schema = assert_tabulated("road-map/1", ROAD_VARIABLES, [NANOSECONDS])
     assert set(ROAD_VARIABLES) - {"axis"} == set(schema["properties"])
     assert set(schema["required"]) == set(ALWAYS)
     assert {n for n in ROAD_VARIABLES if n.startswith("feature_")} == set(FEATURES)
-    for name, variable in schema["properties"].items():
-        rule, stated = ROAD_VARIABLES[name], variable["properties"]
-        assert stated["dims"]["enum"] == [list(rule.dims)], name
-        dtype = stated.get("dtype", {"const": "str"})
-        kinds = tuple(dtype.get("enum", [dtype.get("const")]))
-        if kinds == ("datetime64[ns]",):
-            assert rule.units == NANOSECONDS
-        else:
-            assert kinds == rule.dtypes, name
-            assert stated.get("units", {"const": None})["const"] == rule.units, name

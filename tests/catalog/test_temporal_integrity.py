@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import ppigrf
 import pytest
+from contract_tables import assert_tabulated
 from synthetic_release import World
 from tampering import (
     Bomb,
@@ -35,7 +36,6 @@ from magtiles.catalog.releases.temporal_table import (
     SECONDS,
     TEMPORAL_VARIABLES,
 )
-from magtiles.schemas import contracts
 from magtiles.schemas.errors import ContractError, IntegrityError
 from magtiles.stages.release.temporal_file import write_temporal
 
@@ -182,18 +182,8 @@ def test_the_same_dataset_gives_the_same_bytes(whole: Path, tmp_path: Path) -> N
 
 def test_the_table_is_the_contract() -> None:
     """Dimensions, dtypes and units of the reader's table are those of temporal-model/1."""
-    schema = contracts.load_schema("temporal-model/1")["properties"]["variables"]
+    schema = assert_tabulated("temporal-model/1", TEMPORAL_VARIABLES, [SECONDS, DAYS])
     assert set(TEMPORAL_VARIABLES) == set(schema["properties"])
     assert set(schema["required"]) == set(ALWAYS)
     groups = [set(choice["required"]) for choice in schema["anyOf"]]
     assert groups == [set(BASELINE), set(FOGM)]
-    for name, variable in schema["properties"].items():
-        rule, stated = TEMPORAL_VARIABLES[name], variable["properties"]
-        assert stated["dims"]["enum"] == [list(rule.dims)], name
-        dtype = stated.get("dtype", {"const": "str"})
-        kinds = tuple(dtype.get("enum", [dtype.get("const")]))
-        if kinds == ("datetime64[ns]",):
-            assert rule.units in (SECONDS, DAYS)
-        else:
-            assert kinds == rule.dtypes, name
-            assert stated.get("units", {"const": None})["const"] == rule.units, name
