@@ -8,7 +8,7 @@ from magtiles.schemas.errors import FormatError
 
 
 def first_bytes(path: Path, count: int, expected: str) -> bytes:
-    """At most `count` bytes, and at least one, of what ought to be `expected`.
+    """At most `count` bytes (all for -1), and at least one, of what ought to be `expected`.
 
     Raises FormatError for a missing, empty or unreadable file, and a folder.
     """

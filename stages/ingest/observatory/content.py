@@ -7,6 +7,7 @@ import zlib
 from pathlib import Path
 
 from magtiles.schemas.errors import FormatError
+from magtiles.stages.ingest.first_bytes import first_bytes
 
 _MOST_BYTES = 4 << 30
 """More than a year of one-second records in IAGA-2002; a file that unpacks to more is refused."""
@@ -28,14 +29,7 @@ def read_content(path: Path) -> bytes:
     Raises FormatError for a missing, empty, truncated or unreasonably large file, and for one
     that is by its first bytes an archive, a picture or an HTML page.
     """
-    try:
-        content = path.read_bytes()
-    except FileNotFoundError:
-        raise FormatError(
-            "the file does not exist", where=path, remedy="fetch it or correct the path"
-        ) from None
-    except OSError as caught:
-        raise FormatError(f"cannot be read: {caught.strerror}", where=path) from None
+    content = first_bytes(path, -1, "an observatory's record")
     if content.startswith(_GZIP):
         content = _unpacked(path)
     _refuse_foreign(content, path)
