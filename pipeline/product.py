@@ -14,7 +14,7 @@ from magtiles.pipeline.reference_surface import ReferenceSurface, load_reference
 from magtiles.pipeline.road_sources import RoadSources, RoadsTable, load_roads
 from magtiles.pipeline.source_paths import find_source
 from magtiles.pipeline.temporal_part import TemporalSources, TemporalTable, load_temporal
-from magtiles.schemas.errors import SourceError
+from magtiles.schemas.errors import MissingInputError, SourceError
 from magtiles.stages.declare import IsoDate, Params, parse_params, quantity
 from magtiles.stages.field.direction import DECLINATION_DEG, INCLINATION_DEG
 from magtiles.stages.ingest.field_model import FIELD_MODEL, igrf_coefficients, model_files
@@ -267,7 +267,7 @@ def _model_map(model: ModelTable, product: Path) -> ModelMap:
         files = tuple(model_files(direct))
         return ModelMap(model, direct, direct.stem, "not stated", None, files, core)
     if direct.suffix not in ("", ".toml"):
-        raise SourceError(
+        raise MissingInputError(
             f"coefficient file '{model.coefficients}' does not exist",
             where=f"{product} model.coefficients",
             expected=f"a file at {direct}",

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import pydantic
 
 from magtiles.pipeline.source_paths import find_source
-from magtiles.schemas.errors import SourceError
+from magtiles.schemas.errors import MissingInputError, SourceError
 from magtiles.stages.declare import Params, quantity
 from magtiles.stages.ingest.log.source import TRACK
 from magtiles.stages.ingest.source import Source, load_source
@@ -120,7 +120,7 @@ def _earlier(table: RoadsTable, product: Path, key: str) -> list[Path]:
     found = [product.parent / name for name in table.maps]
     for path in found:
         if not path.is_file():
-            raise SourceError(
+            raise MissingInputError(
                 f"map '{path}' does not exist",
                 where=f"{product} {key}.maps",
                 expected="a file of roads/ in an earlier release, by its path from the product",

@@ -29,7 +29,7 @@ _WORKER_BYTES = 2 << 30
 _PATIENCE_S = 30
 _STARTS = 3
 CLUSTER_SETTINGS: Mapping[str, Any] = {
-    # Without a worker, since one that dies as it comes is not replaced.
+    # How long to wait where no worker is left: one that dies as it comes is not replaced.
     "distributed.scheduler.no-workers-timeout": "300s",
     # A second task for a busy worker would wait while another worker has nothing to do.
     "distributed.scheduler.worker-saturation": 1.0,

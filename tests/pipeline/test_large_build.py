@@ -23,6 +23,7 @@ from magtiles.pipeline.sample import DEMO, synthesize, write_survey
 from magtiles.pipeline.tasks import Tasks, working
 from magtiles.schemas import contracts
 from magtiles.schemas.errors import CoverageError, MagtilesError, UsageError
+from magtiles.stages.release.checks import replay_checks
 
 SPEC = replace(DEMO, name="wide", width_m=190e3, length_m=150e3, dipoles=150, levels_m=(2500.0,))
 
@@ -96,6 +97,10 @@ def test_the_same_bytes_whichever_cluster(products, built, tmp_path, monkeypatch
     for level in levels.glob("level-*.nc"):
         with open_artifact(level) as opened:
             contracts.check(opened, "component-grid/1")
+
+
+def test_checks_that_workers_made_hold_in_one_process(built):
+    assert replay_checks(open_release(built)) < 0.01
 
 
 def test_building_again_makes_nothing(products, built, monkeypatch):

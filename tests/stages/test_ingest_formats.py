@@ -185,16 +185,35 @@ def test_damaged_files_are_refused(refuse: Refuse, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("lines", [1, 5])
+@pytest.mark.parametrize("separator", [" ", ","])
 def test_rows_read_in_parts_are_the_same_grid(
-    lines: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    separator: str, lines: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(xyz, "_PART_LINES", lines)
-    for expect in READ:
-        if expect.id in ("xyz", "csv", "csv-void"):
-            test_a_grid_is_the_same_in_every_format(expect, tmp_path)
-    for refuse in REFUSED:
-        if refuse.id.startswith("xyz"):
-            test_damaged_files_are_refused(refuse, tmp_path)
+    params = IngestGridParams(crs="EPSG:32610", **_SAID)
+    grid = ingest_grid(text(separator)(tmp_path), params=params)
+    np.testing.assert_array_equal(grid.magnetic_anomaly, SMALL.values)
+    np.testing.assert_allclose(grid.x, SMALL.x, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(grid.y, SMALL.y, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("lines", [1, 5])
+@pytest.mark.parametrize(
+    ("new", "message"),
+    [
+        ("501500 5000500 1", "line 11: the node was given before"),
+        ("500500 x -5", r"not numbers.*'x'"),
+        ("500700 5000500 -5", "line 11: x = 500700 is no node"),
+    ],
+)
+def test_a_line_is_named_whichever_part_it_is_in(
+    new: str, message: str, lines: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(xyz, "_PART_LINES", lines)
+    with pytest.raises(FormatError, match=message):
+        ingest_grid(
+            edited(_LAST, new)(tmp_path), params=IngestGridParams(crs="EPSG:32610", **_SAID)
+        )
 
 
 def test_scattered_points_are_told_before_they_are_all_read(

@@ -9,6 +9,7 @@ import socket
 import stat
 import subprocess
 import sys
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,7 @@ from magtiles.stages.release import publish as publish_module
 from magtiles.stages.release.checks import make_checks, replay_checks
 from magtiles.stages.release.lock import locked
 from magtiles.stages.release.publish import published_versions
+from magtiles.stages.release.records import measure_tile
 
 LATTICE = replace(small_lattice(), rows=30, columns=34)
 """Two by two tiles."""
@@ -322,6 +324,35 @@ def test_checks_lie_in_several_tiles_on_seams_and_between_levels(
     assert near_seam.sum() >= 12
     heights = np.array(at["height"])
     assert 0.2 < np.isin(heights, world.heights).mean() < 0.5
+
+
+def test_checks_that_others_make_are_the_same(
+    world: World, tiles: list[Path], tmp_path: Path
+) -> None:
+    """Each part is answered by itself, as a worker does; the order is that of the positions."""
+    release = open_release(world.publish(tmp_path, tiles=tiles).path)
+    asked: list[Path] = []
+
+    def spread(answer: Callable[[Any], Any], questions: Sequence[Any]) -> Iterator[Any]:
+        for question in questions:
+            asked.append(question[0])
+            yield answer(question)
+
+    assert make_checks(release, spread) == make_checks(release)
+    assert replay_checks(release, spread) == replay_checks(release)
+    assert asked == 8 * [release.path.absolute()]
+
+
+def test_a_tile_that_changes_meanwhile_is_not_published(
+    world: World, tiles: list[Path], tmp_path: Path
+) -> None:
+    copies = [Path(shutil.copy(tile, tmp_path / tile.name)) for tile in tiles]
+    measured = [measure_tile(tile) for tile in copies]
+    data = copies[2].read_bytes()
+    copies[2].write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
+    with pytest.raises(ContractError, match=f"{copies[2].name}: changed while it was being publ"):
+        world.publish(tmp_path / "store", tiles=measured)
+    assert [p.name for p in (tmp_path / "store" / "demo").iterdir()] == []
 
 
 def test_replayed_checks_see_a_release_that_answers_otherwise(
